@@ -1,0 +1,1 @@
+"""Batched contact quadratic programs: one problem record, one solution record, three engines."""

@@ -1,0 +1,50 @@
+"""What the rest of the library asks of a shape model.
+
+Two kinds exist: a learned family of outlines (`DeepSDFShape`, one latent per particle)
+and a fixed polygon (`PolygonShape`, latent of size zero). Lengths are metres in the
+object frame at scale 1.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class Shape(Protocol):
+    """A family of closed planar outlines indexed by a latent in [-1, 1]^z."""
+
+    latent_dim: int
+    """Size z of the latent; 0 for a fixed outline."""
+    misfit_sd: float
+    """Standard deviation of the distance between the best outline of the family and an
+    outline it has not seen [m]; 0 where the outline is exact."""
+
+    def signed_distance(
+        self, points_object: Float[Tensor, "*batch p 2"], latent: Float[Tensor, "*batch z"]
+    ) -> Float[Tensor, "*batch p"]:
+        """Signed distance to the outline [m], positive outside the object."""
+        ...
+
+    def boundary_points(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch p 2"]:
+        """Outline points, counter-clockwise, dense where the outline bends [m].
+
+        The number of points p is the same for every latent of one model; differentiable
+        with respect to the latent; dtype and device follow the latent.
+        """
+        ...
+
+    def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
+        """Whether the latent decodes to exactly one closed outline of plausible size."""
+        ...
+
+    def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
+        """Log of the normalised prior density of the latent; -inf where not valid."""
+        ...
+
+    def sample_latent(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
+        """Draw valid latents from the prior, float64 on the CPU."""
+        ...

@@ -1,0 +1,61 @@
+"""The surroundings as signed distance and outward normal at points of the world.
+
+A terrain is anything with `signed_distance` (positive outside the terrain) and `normal`
+(unit, pointing out of it). Floor and wall are half-planes; curved terrain is another
+class with the same two functions. Parameters carry batch axes in front of the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Terrain(Protocol):
+    """A body of the world that the held object can touch."""
+
+    def signed_distance(
+        self, points_world: Float[Tensor, "*batch p 2"]
+    ) -> Float[Tensor, "*batch p"]:
+        """Distance from the surface [m], positive outside the terrain."""
+        ...
+
+    def normal(self, points_world: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p 2"]:
+        """Outward unit normal of the terrain at the surface point nearest to each point."""
+        ...
+
+
+@dataclass(frozen=True)
+class HalfPlane:
+    """All points p with n·p <= offset; `direction` n is the outward unit normal."""
+
+    direction: Float[Tensor, "*batch 2"]
+    offset: Float[Tensor, "*batch"]
+
+    def signed_distance(
+        self, points_world: Float[Tensor, "*batch p 2"]
+    ) -> Float[Tensor, "*batch p"]:
+        """Distance n·p - offset [m]."""
+        return (points_world * self.direction[..., None, :]).sum(-1) - self.offset[..., None]
+
+    def normal(self, points_world: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p 2"]:
+        """The constant n, one for each point."""
+        return self.direction[..., None, :].expand(points_world.shape)
+
+
+def floor(height: Float[Tensor, "*batch"]) -> HalfPlane:
+    """Floor below world z = height [m]; its normal points up."""
+    return HalfPlane(_constant_direction(height, 0.0, 1.0), height)
+
+
+def wall(position: Float[Tensor, "*batch"]) -> HalfPlane:
+    """Wall beyond world x = position [m]; its normal points towards -x."""
+    return HalfPlane(_constant_direction(position, -1.0, 0.0), -position)
+
+
+def _constant_direction(like: Tensor, x: float, z: float) -> Tensor:
+    return torch.stack((torch.full_like(like, x), torch.full_like(like, z)), dim=-1)

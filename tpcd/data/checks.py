@@ -1,0 +1,162 @@
+"""What the rows of an episode must obey, and what merely looks odd about them.
+
+`check_rows` refuses rows that cannot be data in the agreed units; `check_episode` returns
+sentences on what is possible but suspicious, such as a wrench of the wrong sign. Rows are
+counted from 0, the free start pose.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tpcd.data.header import LARGEST_LENGTH, SENSOR_NAMES
+from tpcd.data.table import row_name
+from tpcd.errors import EpisodeError
+
+if TYPE_CHECKING:
+    from tpcd.data.episode import Episode
+
+COMMAND_COLUMNS = ("u_x", "u_z", "u_phi")
+POSE_COLUMNS = ("x", "z", "phi")
+WRENCH_COLUMNS = ("F_x", "F_z", "tau")
+LARGEST_JUMP = 0.5
+"""Commands of neighbouring rows further apart than this [m] are taken for an error."""
+NOISE_FACTOR = 6.0
+"""Differences beyond this many standard deviations are not noise (1 in 5e8 for a normal)."""
+ROUNDING = 1e-6
+"""Start pose and command may differ by this much [m, rad] on top of noise: printed digits."""
+
+
+def check_steps(path: Path, steps: np.ndarray) -> None:
+    """Steps must be 0, 1, 2, … without gaps; at least a start row and one step."""
+    if len(steps) == 0:
+        raise EpisodeError(path, "no rows below the header", "record a start pose and steps")
+    for row, step in enumerate(steps):
+        if step == row:
+            continue
+        where = f"{row_name(row, path)}, column step: found {step:g}, expected {row}"
+        if row and step == steps[row - 1]:
+            problem, remedy = f"{where} (repeated)", "keep one row for each step"
+        elif row and step < steps[row - 1]:
+            problem, remedy = f"{where} (steps go backwards)", "sort the rows by step"
+        elif not float(step).is_integer():
+            problem, remedy = f"{where} (not a whole number)", "number the rows 0, 1, 2, …"
+        elif row:
+            problem, remedy = f"{where} (rows missing)", "restore them or split the episode there"
+        else:
+            problem, remedy = where, "row 0 is the free start pose; number the rows 0, 1, 2, …"
+        raise EpisodeError(path, problem, remedy)
+    if len(steps) < 2:
+        raise EpisodeError(path, "only the start row, no step", "record at least one step")
+
+
+def check_rows(
+    path: Path,
+    commands: np.ndarray,
+    poses: np.ndarray,
+    wrenches: np.ndarray,
+    sensor_std: np.ndarray,
+) -> None:
+    """Refuse rows (n, 3) that are not finite, not SI, jump, or do not start at rest.
+
+    Raises `EpisodeError` naming row and column.
+    """
+    columns = (
+        (COMMAND_COLUMNS, commands, True),
+        (POSE_COLUMNS, poses, True),
+        (WRENCH_COLUMNS, wrenches, False),
+    )
+    for names, values, is_pose in columns:
+        for axis, name in enumerate(names):
+            _check_column(path, name, values[:, axis], axis, is_pose)
+    jumps = np.linalg.norm(np.diff(commands[:, :2], axis=0), axis=1)
+    if len(jumps) and jumps.max() > LARGEST_JUMP:
+        row = int(np.argmax(jumps > LARGEST_JUMP)) + 1
+        raise EpisodeError(
+            path,
+            f"{row_name(row, path)}, columns u_x, u_z: the command jumps by {jumps[row - 1]:.3g} m,"
+            f" expected at most {LARGEST_JUMP} m",
+            "check the frame of the commands, or split the episode there",
+        )
+    offset = np.abs(commands[0] - poses[0])
+    offset[2] = abs(math.remainder(offset[2], 2 * math.pi))
+    allowed = NOISE_FACTOR * sensor_std[:3] + ROUNDING
+    for axis in np.flatnonzero(offset > allowed):
+        raise EpisodeError(
+            path,
+            f"{row_name(0, path)}, column {COMMAND_COLUMNS[axis]}: found {commands[0, axis]:.6g},"
+            f" expected the start pose {POSE_COLUMNS[axis]} = {poses[0, axis]:.6g}"
+            f" within {allowed[axis]:.2g}",
+            "start free of contact and set command 0 to the measured pose",
+        )
+
+
+def _check_column(path: Path, name: str, column: np.ndarray, axis: int, is_pose: bool) -> None:
+    finite = np.isfinite(column)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise EpisodeError(
+            path,
+            f"{row_name(row, path)}, column {name}: found {column[row]}, expected a finite number",
+            "drop the step from the recording or measure it again",
+        )
+    if not is_pose:
+        return
+    largest, unit, likely = (
+        (2 * math.pi, "rad", "degrees") if axis == 2 else (LARGEST_LENGTH, "m", "millimetres")
+    )
+    if len(column) and np.abs(column).max() > largest:
+        row = int(np.argmax(np.abs(column) > largest))
+        raise EpisodeError(
+            path,
+            f"{row_name(row, path)}, column {name}: found {column[row]:g}, expected {unit}"
+            f" (at most {largest:.3g}); it looks like {likely}",
+            f"convert the column to {unit}",
+        )
+
+
+def check_episode(episode: Episode) -> list[str]:
+    """Sentences on what is suspicious in an episode that obeys the format; often none.
+
+    In equilibrium the wrench is K (pose - command); rows whose wrench has the opposite
+    sign or another size speak for a sign or unit error of the sensor or of the stiffness.
+    """
+    warnings = []
+    wrenches = episode.wrenches.numpy()
+    deviations = (episode.poses - episode.commands).numpy()
+    deviations[:, 2] = [math.remainder(angle, 2 * math.pi) for angle in deviations[:, 2]]
+    expected = deviations * episode.stiffness.numpy()
+    noise = episode.sensor_std.numpy()
+    expected_noise = np.hypot(noise[3:], episode.stiffness.numpy() * noise[:3])
+    significant = np.abs(expected) > NOISE_FACTOR * expected_noise + 1e-9
+    for axis, name in enumerate(WRENCH_COLUMNS):
+        rows = significant[:, axis]
+        if not rows.any():
+            continue
+        slope = float(
+            (wrenches[rows, axis] @ expected[rows, axis]) / (expected[rows, axis] ** 2).sum()
+        )
+        if slope < -0.3:
+            warnings.append(
+                f"{name} looks inverted: it is {slope:.2f} times K (pose - command); expected is"
+                " what the world exerts on the object, so pressing on the floor gives F_z > 0"
+            )
+        elif not 0.5 < slope < 2.0:
+            warnings.append(
+                f"{name} is {slope:.2g} times K (pose - command), expected about 1; check the"
+                " stiffness, the units and whether the arm had settled"
+            )
+    if not significant.any():
+        warnings.append("no step shows contact beyond the noise: nothing can be learnt from it")
+    start = np.abs(wrenches[0]) > NOISE_FACTOR * noise[3:] + 1e-9
+    if noise[3:].any() and start.any():
+        names = ", ".join(np.array(WRENCH_COLUMNS)[start])
+        warnings.append(f"row 0 shows {names} beyond noise: it must be free; zero the sensor there")
+    silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
+    if silent:
+        warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")
+    return warnings

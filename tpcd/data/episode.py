@@ -1,0 +1,229 @@
+"""An episode: commands, settled poses and wrenches of one recording, and its files.
+
+Row k holds command k and what was measured once the arm had settled after it; row 0 is
+the free start pose, its command equal to the pose. On disk an episode is a pair of files,
+NAME.csv (or .parquet) with the columns step, u_x, u_z, u_phi, x, z, phi, F_x, F_z, tau and
+NAME.yaml with stiffness, sensor noise and priors; further columns are kept. SI units.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.data.checks import (
+    COMMAND_COLUMNS,
+    POSE_COLUMNS,
+    WRENCH_COLUMNS,
+    check_rows,
+    check_steps,
+)
+from tpcd.data.header import Header, encode_header, parse_header, read_header
+from tpcd.data.table import Table, encode_table, read_table
+from tpcd.errors import EpisodeError
+
+COLUMNS = ("step", *COMMAND_COLUMNS, *POSE_COLUMNS, *WRENCH_COLUMNS)
+TABLE_SUFFIXES = (".csv", ".parquet")
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One recording of n rows; all tensors are float64 on the CPU, in SI units.
+
+    Poses and commands are (x, z, phi) [m, m, rad] of the end effector in the world;
+    wrenches (F_x, F_z, tau) [N, N, N·m] are what the world exerts on the object about the
+    end-effector origin, in world axes. `ValueError` for tensors of another shape or dtype.
+    """
+
+    commands: Float[Tensor, "n 3"]
+    poses: Float[Tensor, "n 3"]
+    wrenches: Float[Tensor, "n 3"]
+    stiffness: Float[Tensor, " 3"]
+    """Diagonal of K [N/m, N/m, N·m/rad]."""
+    sensor_std: Float[Tensor, " 6"]
+    """One standard deviation of the noise of x, z, phi, F_x, F_z, tau in their units."""
+    object: str | None = None
+    notes: str | None = None
+    time_step_s: float | None = None
+    priors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Uniform priors (low, high) for entries of theta; what is missing takes the defaults."""
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+    """Further columns of the table, each of length n."""
+    path: Path | None = None
+    """The table the episode was read from."""
+
+    def __post_init__(self) -> None:
+        n = self.commands.shape[0] if self.commands.ndim else 0
+        shapes = {"commands": (n, 3), "poses": (n, 3), "wrenches": (n, 3)}
+        for name, shape in {**shapes, "stiffness": (3,), "sensor_std": (6,)}.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape or value.dtype != torch.float64:
+                raise ValueError(
+                    f"{name} is {tuple(value.shape)} {value.dtype}, expected {shape} torch.float64"
+                )
+        for name, column in self.extra.items():
+            if name in COLUMNS or np.shape(column) != (n,):
+                raise ValueError(f"extra column {name!r} must be new and of length {n}")
+
+    def __len__(self) -> int:
+        """Number of rows, the start row included."""
+        return self.commands.shape[0]
+
+
+def read_episode(path: str | Path) -> Episode:
+    """Read an episode from NAME.csv, NAME.parquet, NAME.yaml, NAME or a folder with one.
+
+    Raises `EpisodeError` with one line that names file, row, column, what was found, what
+    is expected and what to do.
+    """
+    table_path, header_path = _locate(Path(path))
+    header = read_header(header_path)
+    table = read_table(table_path, COLUMNS)
+    check_steps(table_path, table["step"])
+    commands, poses, wrenches = (
+        np.stack([table[name] for name in names], axis=1)
+        for names in (COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS)
+    )
+    check_rows(table_path, commands, poses, wrenches, np.array(header.sensor_std))
+    return Episode(
+        commands=torch.from_numpy(commands),
+        poses=torch.from_numpy(poses),
+        wrenches=torch.from_numpy(wrenches),
+        stiffness=torch.tensor(header.stiffness, dtype=torch.float64),
+        sensor_std=torch.tensor(header.sensor_std, dtype=torch.float64),
+        object=header.object,
+        notes=header.notes,
+        time_step_s=header.time_step_s,
+        priors=header.priors,
+        extra={name: column for name, column in table.items() if name not in COLUMNS},
+        path=table_path,
+    )
+
+
+def write_episode(
+    episode: Episode,
+    path: str | Path,
+    format: Literal["csv", "parquet"] = "csv",
+    overwrite: bool = False,
+) -> Path:
+    """Write the pair NAME.csv (or .parquet) and NAME.yaml; returns the path of the table.
+
+    `path` is NAME with or without suffix; the folder is made if needed. Both files appear
+    complete or not at all. Raises `EpisodeError` if a file of that name exists and
+    `overwrite` is false, or if the content breaks the format.
+    """
+    if format not in ("csv", "parquet"):
+        raise ValueError(f"format is {format!r}, expected 'csv' or 'parquet'")
+    stem = _stem(Path(path))
+    table_path, header_path = _add(stem, f".{format}"), _add(stem, ".yaml")
+    commands, poses, wrenches = (
+        value.numpy() for value in (episode.commands, episode.poses, episode.wrenches)
+    )
+    header = Header(
+        stiffness=tuple(episode.stiffness.tolist()),
+        sensor_std=tuple(episode.sensor_std.tolist()),
+        object=episode.object,
+        notes=episode.notes,
+        time_step_s=episode.time_step_s,
+        priors=dict(episode.priors),
+    )
+    header_bytes = encode_header(header)
+    parse_header(yaml.safe_load(header_bytes), header_path)
+    table: Table = {"step": np.arange(len(episode), dtype=np.int64)}
+    for names, values in (
+        (COMMAND_COLUMNS, commands),
+        (POSE_COLUMNS, poses),
+        (WRENCH_COLUMNS, wrenches),
+    ):
+        table.update({name: values[:, axis] for axis, name in enumerate(names)})
+    check_steps(table_path, table["step"])
+    check_rows(table_path, commands, poses, wrenches, episode.sensor_std.numpy())
+    other_path = _add(stem, ".csv" if format == "parquet" else ".parquet")
+    for existing in (table_path, other_path, header_path):
+        if existing.exists() and not overwrite:
+            raise EpisodeError(existing, "exists already", "choose another name or overwrite")
+    write_together(
+        {
+            header_path: header_bytes,
+            table_path: encode_table({**table, **episode.extra}, table_path),
+        }
+    )
+    other_path.unlink(missing_ok=True)
+    return table_path
+
+
+def write_together(contents: dict[Path, bytes]) -> None:
+    """Write several files so that all appear complete or, on failure, all stay as they were."""
+    staged: dict[Path, Path] = {}
+    backups: dict[Path, bytes | None] = {}
+    try:
+        for path, content in contents.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+            staged[path] = Path(name)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+            os.chmod(name, 0o644)
+        for path, temporary in staged.items():
+            backups[path] = path.read_bytes() if path.exists() else None
+            os.replace(temporary, path)
+    except BaseException:
+        for path, before in backups.items():
+            if before is None:
+                path.unlink(missing_ok=True)
+            else:
+                path.write_bytes(before)
+        raise
+    finally:
+        for temporary in staged.values():
+            temporary.unlink(missing_ok=True)
+
+
+def _locate(path: Path) -> tuple[Path, Path]:
+    """Table and header of the episode that `path` names."""
+    if path.is_dir():
+        names = sorted(
+            {
+                _stem(file)
+                for file in path.iterdir()
+                if file.suffix in TABLE_SUFFIXES
+                and not _stem(file).name.endswith(".truth")
+                and not file.name.startswith(".")
+            }
+        )
+        if len(names) != 1:
+            found = ", ".join(name.name for name in names[:6]) or "none"
+            raise EpisodeError(
+                path,
+                f"found {len(names)} episodes ({found}) in the folder, expected one",
+                "name the file NAME.csv" if names else "put NAME.csv and NAME.yaml there",
+            )
+        path = names[0]
+    stem = _stem(path)
+    tables = [_add(stem, suffix) for suffix in TABLE_SUFFIXES if _add(stem, suffix).is_file()]
+    if path.suffix in TABLE_SUFFIXES:
+        return path, _add(stem, ".yaml")
+    if len(tables) > 1:
+        raise EpisodeError(stem, "has both a .csv and a .parquet table", "name one of them")
+    if not tables:
+        missing = _add(stem, ".csv")
+        raise EpisodeError(missing, "no such file", "give NAME.csv, NAME.parquet or their folder")
+    return tables[0], _add(stem, ".yaml")
+
+
+def _stem(path: Path) -> Path:
+    """NAME of NAME.csv, NAME.parquet or NAME.yaml; dots elsewhere in the name stay."""
+    return path.with_suffix("") if path.suffix in (*TABLE_SUFFIXES, ".yaml") else path
+
+
+def _add(stem: Path, suffix: str) -> Path:
+    return stem.with_name(stem.name + suffix)

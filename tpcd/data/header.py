@@ -1,0 +1,194 @@
+"""The YAML beside an episode: stiffness, sensor noise and what else is known of the scene.
+
+Keys: `stiffness` [N/m, N/m, N·m/rad] and `sensor_std` (x, z [m], phi [rad], F_x, F_z [N],
+tau [N·m]) are required; `object`, `notes`, `time_step_s` [s] and `priors` (name of a scene
+parameter to [low, high], SI) are optional; anything else is refused with a hint.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tpcd.errors import EpisodeError
+from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
+
+REQUIRED_KEYS = ("stiffness", "sensor_std")
+OPTIONAL_KEYS = ("object", "notes", "time_step_s", "priors")
+SENSOR_NAMES = ("x", "z", "phi", "F_x", "F_z", "tau")
+ESTIMATE_NOISE = (
+    "hold the arm still without contact, record for about 10 s and give the standard deviation"
+    " of x, z [m], phi [rad], F_x, F_z [N], tau [N·m], e.g."
+    " sensor_std: [0.0002, 0.0002, 0.0005, 0.3, 0.3, 0.02]"
+)
+LARGEST_LENGTH = 5.0
+"""Lengths beyond this [m] are taken for millimetres."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the YAML of an episode says, in SI units."""
+
+    stiffness: tuple[float, float, float]
+    sensor_std: tuple[float, float, float, float, float, float]
+    object: str | None
+    notes: str | None
+    time_step_s: float | None
+    priors: dict[str, tuple[float, float]]
+
+
+def read_header(path: Path) -> Header:
+    """Read and check NAME.yaml; raises `EpisodeError` naming the key."""
+    if not path.is_file():
+        raise EpisodeError(
+            path,
+            "no such file: every episode has a YAML beside its table",
+            "write one with the keys stiffness and sensor_std",
+        )
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}" if mark else ""
+        raise EpisodeError(path, f"not valid YAML{where}", "correct it by hand") from error
+    return parse_header(content, path)
+
+
+def parse_header(content: Any, path: Path) -> Header:
+    """Check the parsed YAML of an episode; `path` only names the file in errors."""
+    if not isinstance(content, dict):
+        found = "an empty file" if content is None else type(content).__name__
+        raise EpisodeError(path, f"found {found}, expected keys", "give stiffness and sensor_std")
+    known = (*REQUIRED_KEYS, *OPTIONAL_KEYS)
+    for key in content:
+        _check_known(path, "key", str(key), known)
+    for key in REQUIRED_KEYS:
+        if key not in content:
+            remedy = ESTIMATE_NOISE if key == "sensor_std" else "e.g. stiffness: [100, 100, 50]"
+            raise EpisodeError(path, f"key {key} is missing", remedy)
+    stiffness = _numbers(path, "stiffness", content["stiffness"], 3, "[N/m, N/m, N·m/rad]")
+    for axis, value in zip(("x", "z", "phi"), stiffness, strict=True):
+        if value <= 0:
+            raise EpisodeError(
+                path, f"stiffness of {axis} is {value:g}, expected > 0", "give the controller's K"
+            )
+    sensor_std = _numbers(
+        path, "sensor_std", content["sensor_std"], 6, "[x, z, phi, F_x, F_z, tau]", ESTIMATE_NOISE
+    )
+    for name, value in zip(SENSOR_NAMES, sensor_std, strict=True):
+        if value < 0:
+            raise EpisodeError(
+                path, f"sensor_std of {name} is {value:g}, expected >= 0", ESTIMATE_NOISE
+            )
+    time_step = content.get("time_step_s")
+    if time_step is not None:
+        time_step = _number(path, "time_step_s", time_step)
+        if time_step <= 0:
+            raise EpisodeError(path, f"time_step_s is {time_step:g}, expected > 0", "give seconds")
+    return Header(
+        stiffness=tuple(stiffness),  # type: ignore[arg-type]
+        sensor_std=tuple(sensor_std),  # type: ignore[arg-type]
+        object=_text(path, "object", content.get("object")),
+        notes=_text(path, "notes", content.get("notes")),
+        time_step_s=time_step,
+        priors=_priors(path, content.get("priors")),
+    )
+
+
+def encode_header(header: Header) -> bytes:
+    """Content of NAME.yaml; floats keep every bit, keys that say nothing are left out."""
+    content: dict[str, Any] = {
+        "stiffness": list(header.stiffness),
+        "sensor_std": list(header.sensor_std),
+    }
+    for key in ("object", "notes", "time_step_s"):
+        if getattr(header, key) is not None:
+            content[key] = getattr(header, key)
+    if header.priors:
+        content["priors"] = {
+            name: [float(low), float(high)] for name, (low, high) in header.priors.items()
+        }
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return text.encode("utf-8")
+
+
+def _priors(path: Path, content: Any) -> dict[str, tuple[float, float]]:
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise EpisodeError(
+            path,
+            f"priors is {content!r}, expected name: [low, high]",
+            f"names are {', '.join(SCENE_NAMES)}",
+        )
+    priors: dict[str, tuple[float, float]] = {}
+    for name, value in content.items():
+        _check_known(path, "prior", str(name), SCENE_NAMES)
+        unit = SCENE_UNITS[SCENE_NAMES.index(name)]
+        low, high = _numbers(path, f"priors: {name}", value, 2, f"[low, high] [{unit}]")
+        if not low < high:
+            raise EpisodeError(
+                path,
+                f"priors: {name} is [{low:g}, {high:g}], expected low < high",
+                "swap them, or give a narrow range around a known value",
+            )
+        largest, likely = (2 * math.pi, "degrees") if unit == "rad" else (LARGEST_LENGTH, "mm")
+        if unit != "1" and max(abs(low), abs(high)) > largest:
+            raise EpisodeError(
+                path, f"priors: {name} is [{low:g}, {high:g}], which looks like {likely}",
+                f"give it in {unit}",
+            )  # fmt: skip
+        if low < 0 and name == "friction" or low <= 0 and name == "scale":
+            raise EpisodeError(
+                path, f"priors: {name} starts at {low:g}, expected a positive range", "raise low"
+            )
+        priors[name] = (low, high)
+    return priors
+
+
+def _check_known(path: Path, kind: str, name: str, known: tuple[str, ...]) -> None:
+    if name in known:
+        return
+    close = difflib.get_close_matches(name, known, 1, 0.6)
+    remedy = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+    if kind == "key" and not close:
+        remedy += "; put remarks under notes"
+    raise EpisodeError(path, f"unknown {kind} {name!r}", remedy)
+
+
+def _numbers(
+    path: Path, key: str, value: Any, count: int, meaning: str, remedy: str = ""
+) -> list[float]:
+    if not isinstance(value, list) or len(value) != count:
+        found = f"{len(value)} entries" if isinstance(value, list) else repr(value)
+        raise EpisodeError(
+            path, f"{key}: found {found}, expected {count} numbers {meaning}", remedy or "complete"
+            " the list",
+        )  # fmt: skip
+    return [_number(path, key, entry) for entry in value]
+
+
+def _number(path: Path, key: str, value: Any) -> float:
+    """A finite number; text such as '2e-4', which YAML 1.1 does not read as a number, counts."""
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise EpisodeError(
+            path, f"{key}: found {value!r}, expected a finite number", "write a plain number"
+        )
+    return number
+
+
+def _text(path: Path, key: str, value: Any) -> str | None:
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, int | float):
+        return str(value)
+    raise EpisodeError(path, f"{key}: found {value!r}, expected text", "put it in quotes")

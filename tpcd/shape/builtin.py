@@ -1,0 +1,331 @@
+"""Built-in outlines of household objects, made in code from published dimensions.
+
+Each entry is a maker, its dimensions in mm and where these come from, so a machine without
+any data set can train, simulate and test. Outlines come out in metres, counter-clockwise,
+centred, with edges rounded by 1 to 3 mm. `random_outlines` draws variants with every
+dimension scaled by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from shapely.geometry import Polygon
+
+from tpcd.errors import OutlineError
+from tpcd.shape import makers
+from tpcd.shape.outline import Outline, make_outline
+
+CURVE_TOLERANCE = 0.03
+"""Largest distance between a drawn curve and its polygon [mm]."""
+ATTEMPTS = 50
+"""Draws of a variant before giving up; parts that fall apart or cross are drawn again."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One household object: how it is drawn, how large it is, who says so."""
+
+    maker: Callable[..., Polygon]
+    """Draws the silhouette from the dimensions."""
+    dimensions: dict[str, float]
+    """Arguments of the maker [mm; `bend` in degrees]."""
+    source: str
+    """The standard or product the dimensions are taken from."""
+    edge: float = 2.0
+    """Radius of the edges [mm]."""
+
+
+def _entry(maker: Callable[..., Polygon], source: str, edge: float = 2.0, **sizes: float) -> Entry:
+    return Entry(maker=maker, dimensions=sizes, source=source, edge=edge)
+
+
+_PRODUCT = "typical retail product"
+
+ENTRIES: dict[str, Entry] = {
+    "soup_can": _entry(makers.box, "US can size 211 x 400", width=68.3, height=101.6),
+    "tuna_can": _entry(makers.box, "US can size 307 x 113", width=87.3, height=46.0),
+    "coffee_can": _entry(makers.box, "US can size 401 x 411", width=103.2, height=119.1),
+    "drink_can": _entry(
+        makers.capped_bottle,
+        "330 ml beverage can: body 211, end 202, height 115 mm",
+        body=66.2,
+        body_height=95,
+        shoulder=14,
+        neck=54,
+        neck_height=3,
+        cap=56,
+        cap_height=3,
+    ),
+    "wine_bottle": _entry(
+        makers.bottle,
+        "0.75 l Bordeaux bottle, EN 12726 mouth",
+        body=76,
+        body_height=190,
+        shoulder=35,
+        neck=30,
+        neck_height=75,
+    ),
+    "beer_bottle": _entry(
+        makers.capped_bottle,
+        "0.33 l longneck bottle, crown cork DIN 6099",
+        body=61,
+        body_height=130,
+        shoulder=55,
+        neck=27,
+        neck_height=37,
+        cap=32,
+        cap_height=6,
+    ),
+    "water_bottle": _entry(
+        makers.capped_bottle,
+        "0.5 l PET bottle, neck finish PCO 1881",
+        body=65,
+        body_height=140,
+        shoulder=45,
+        neck=26,
+        neck_height=8,
+        cap=31,
+        cap_height=16,
+    ),
+    "jam_jar": _entry(
+        makers.capped_bottle,
+        "370 ml jar, twist-off lid TO 66",
+        body=74,
+        body_height=90,
+        shoulder=9,
+        neck=62,
+        neck_height=3,
+        cap=69,
+        cap_height=12,
+    ),
+    "spray_bottle": _entry(
+        makers.spray_bottle,
+        "0.75 l cleaner, trigger neck 28/400",
+        body=92,
+        body_height=150,
+        shoulder=55,
+        neck=30,
+        neck_height=15,
+        head=44,
+        head_height=32,
+        nozzle=40,
+        trigger=38,
+    ),
+    "cereal_box": _entry(makers.box, _PRODUCT + ", 375 g", width=190, height=280),
+    "juice_carton": _entry(makers.box, "1 l slim brick carton", width=90, height=195),
+    "milk_carton": _entry(
+        makers.gable_carton,
+        "1 l gable-top carton, base 70 x 70 mm",
+        width=70,
+        height=195,
+        gable=32,
+        fin=16,
+    ),
+    "book": _entry(makers.box, "ISO 216 A5, hard cover 30 mm", width=30, height=210),
+    "bank_card": _entry(
+        makers.card, "ISO/IEC 7810 ID-1", edge=1, width=85.6, height=53.98, corner=3.18
+    ),
+    "phone": _entry(makers.card, "6.1 inch telephone", width=71.5, height=146.7, corner=11),
+    "remote_control": _entry(makers.card, _PRODUCT, width=46, height=178, corner=14),
+    "brick": _entry(makers.box, "DIN 105 normal format", edge=3, width=240, height=71),
+    "cube_puzzle": _entry(makers.box, "3 x 3 x 3 cube puzzle", width=57, height=57),
+    "hex_nut": _entry(makers.regular, "ISO 4032 M36", edge=1, across_flats=55),
+    "battery": _entry(
+        makers.capped_bottle,
+        "IEC 60086-2 R20 (D)",
+        edge=1,
+        body=34.2,
+        body_height=59.0,
+        shoulder=0.5,
+        neck=33,
+        neck_height=0.5,
+        cap=9.5,
+        cap_height=1.5,
+    ),
+    "tennis_ball": _entry(makers.ball, "ITF rules: 65.4 to 68.6 mm", diameter=67),
+    "golf_ball": _entry(makers.ball, "R&A rules: 42.67 mm", diameter=42.67),
+    "soap_bar": _entry(makers.ellipse, _PRODUCT + ", 100 g", width=90, height=58),
+    "egg": _entry(makers.egg, "EU size L", width=45, height=59, blunt=25),
+    "apple": _entry(makers.apple, "EU class I, 75 mm", width=78, height=71, dimple=9),
+    "pear": _entry(makers.pear, "EU class I, 65 mm", width=68, height=108, crown=30),
+    "banana": _entry(
+        makers.bent_fruit, "EU grade, 200 mm", length=200, thickness=36, bend=80, tip=9
+    ),
+    "paper_cup": _entry(makers.tapered, "12 oz paper cup", bottom=60, top=90, height=110),
+    "mug": _entry(
+        makers.mug, "11 oz mug", diameter=82, height=95, handle_reach=33, handle_height=68
+    ),
+    "bowl": _entry(makers.bowl, _PRODUCT, rim=155, foot=70, height=62, foot_height=6),
+    "wine_glass": _entry(
+        makers.wine_glass,
+        "ISO 3591 style tasting glass, scaled to 400 ml",
+        foot=72,
+        stem=8,
+        stem_height=85,
+        bowl=82,
+        bowl_height=110,
+    ),
+    "light_bulb": _entry(
+        makers.light_bulb, "IEC A60 with E27 base", globe=60, height=106, base=26.5, base_height=27
+    ),
+    "toothpaste": _entry(
+        makers.squeeze_tube, "75 ml tube", crimp=56, shoulder=38, length=130, cap=30, cap_height=25
+    ),
+    "screwdriver": _entry(
+        makers.screwdriver,
+        "ISO 2380 blade 1.2 x 6.5 x 150",
+        handle=34,
+        handle_length=110,
+        shaft=6.5,
+        shaft_length=150,
+    ),
+    "hammer": _entry(
+        makers.hammer,
+        "DIN 1041 500 g",
+        length=320,
+        handle=26,
+        head_length=118,
+        head_height=36,
+        face=27,
+    ),
+    "wrench": _entry(
+        makers.wrench,
+        "DIN 3113 A combination spanner 24 mm",
+        length=260,
+        shank=20,
+        head=52,
+        ring=37,
+        jaw=24,
+    ),
+    "spoon": _entry(
+        makers.spoon,
+        "table spoon, 200 mm",
+        edge=1,
+        length=200,
+        bowl_length=68,
+        bowl_width=44,
+        neck=8,
+        end=20,
+    ),
+    "kitchen_knife": _entry(
+        makers.knife,
+        _PRODUCT + ", 200 mm blade",
+        edge=1,
+        length=330,
+        blade=45,
+        blade_length=205,
+        handle=28,
+    ),
+    "c_clamp": _entry(
+        makers.c_clamp,
+        "100 mm C-clamp",
+        opening=100,
+        throat=60,
+        bar=20,
+        screw=13,
+        screw_length=150,
+    ),
+    "toothbrush": _entry(
+        makers.toothbrush,
+        "ISO 20126 adult brush",
+        edge=1,
+        length=190,
+        handle=14,
+        neck=5.5,
+        head=12,
+        head_length=28,
+    ),
+    "saucepan": _entry(
+        makers.saucepan, "160 mm saucepan", diameter=160, height=80, handle_length=160, handle=20
+    ),
+    "cordless_drill": _entry(
+        makers.drill,
+        "18 V drill driver",
+        body_length=140,
+        body=62,
+        chuck=44,
+        chuck_length=45,
+        grip=42,
+        grip_length=90,
+        battery=115,
+        battery_height=45,
+    ),
+    "dumbbell": _entry(
+        makers.dumbbell, "2 kg hexagonal dumbbell", length=180, head=72, head_length=55, grip=28
+    ),
+    "shelf_bracket": _entry(makers.bracket, _PRODUCT, width=125, height=150, thickness=20),
+    "pliers": _entry(
+        makers.pliers,
+        "ISO 5746 combination pliers 180 mm",
+        length=180,
+        jaw_length=45,
+        width=26,
+        arm=13,
+        spread=50,
+    ),
+    "scissors": _entry(
+        makers.scissors,
+        "200 mm household scissors",
+        length=205,
+        blade_length=110,
+        blade=26,
+        loop=40,
+        loop_height=70,
+    ),
+    "padlock": _entry(
+        makers.padlock, "50 mm padlock", width=50, height=42, shackle=38, shackle_height=38
+    ),
+    "stapler": _entry(makers.stapler, "24/6 desk stapler", length=140, base=14, gap=18, arm=32),
+}
+"""All built-in objects by name."""
+
+
+def builtin_outlines() -> dict[str, Outline]:
+    """All built-in outlines by name [m]."""
+    return {name: make_entry(name, entry) for name, entry in ENTRIES.items()}
+
+
+def make_entry(name: str, entry: Entry) -> Outline:
+    """Draw one entry [m].
+
+    Raises:
+        ValueError: its dimensions give no single piece.
+        OutlineError: they give an outline of implausible size.
+    """
+    sharp = entry.maker(**entry.dimensions)
+    smooth = makers.rounded(sharp, entry.edge).simplify(CURVE_TOLERANCE)
+    vertices = np.asarray(smooth.exterior.coords)[:-1] / 1000.0
+    return make_outline(name, vertices, source=entry.source, notes="made in code")
+
+
+def vary(entry: Entry, rng: np.random.Generator, spread: float = 0.25) -> Entry:
+    """The entry with each dimension scaled by its own factor from U[1 - spread, 1 + spread]."""
+    if not 0.0 <= spread < 1.0:
+        raise ValueError(f"spread must lie in [0, 1), got {spread}")
+    factors = rng.uniform(1 - spread, 1 + spread, len(entry.dimensions))
+    sizes = {
+        key: size * f for (key, size), f in zip(entry.dimensions.items(), factors, strict=True)
+    }
+    return Entry(entry.maker, sizes, f"{entry.source}, varied by {spread:.0%}", entry.edge)
+
+
+def random_outlines(count: int, rng: np.random.Generator, spread: float = 0.25) -> list[Outline]:
+    """Variants of randomly chosen entries, named `<entry>~<number>`; valid outlines only."""
+    names = sorted(ENTRIES)
+    outlines = []
+    for index in range(count):
+        name = names[rng.integers(len(names))]
+        outlines.append(_draw_variant(f"{name}~{index}", ENTRIES[name], rng, spread))
+    return outlines
+
+
+def _draw_variant(name: str, entry: Entry, rng: np.random.Generator, spread: float) -> Outline:
+    for _ in range(ATTEMPTS):
+        try:
+            return make_entry(name, vary(entry, rng, spread))
+        except (ValueError, OutlineError):
+            continue
+    raise RuntimeError(f"no valid variant of {name} in {ATTEMPTS} draws at spread {spread}")

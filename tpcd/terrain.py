@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -26,6 +26,14 @@ class Terrain(Protocol):
 
     def normal(self, points_world: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p 2"]:
         """Outward unit normal of the terrain at the surface point nearest to each point."""
+        ...
+
+    def double(self) -> Terrain:
+        """The same terrain in float64."""
+        ...
+
+    def gather(self, index: Int[Tensor, "*batch"]) -> Terrain:
+        """The terrains at positions `index` of the flattened batch."""
         ...
 
 
@@ -45,6 +53,14 @@ class HalfPlane:
     def normal(self, points_world: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p 2"]:
         """The constant n, one for each point."""
         return self.direction[..., None, :].expand(points_world.shape)
+
+    def double(self) -> HalfPlane:
+        """The same half-planes in float64."""
+        return HalfPlane(self.direction.double(), self.offset.double())
+
+    def gather(self, index: Int[Tensor, "*batch"]) -> HalfPlane:
+        """The half-planes at positions `index` of the flattened batch."""
+        return HalfPlane(self.direction.reshape(-1, 2)[index], self.offset.reshape(-1)[index])
 
 
 def floor(height: Float[Tensor, "*batch"]) -> HalfPlane:

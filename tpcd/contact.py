@@ -1,0 +1,134 @@
+"""Contact geometry: which points of the held object come near which terrain, and how.
+
+A `ContactScene` holds, for each element of the batch, the outline of the object in the
+end-effector frame and the terrains it can touch. For a pose it gives gaps, contact frames
+and point Jacobians; the Jacobian of a world point p = x + R(angle) r with respect to the
+pose (x, z, angle) is [I | R r turned by 90 degrees].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tpcd.parameters import Parameters
+from tpcd.planar import perpendicular, rotate, transform_points
+from tpcd.shape.protocol import Shape
+from tpcd.terrain import Terrain, floor, wall
+
+
+@dataclass(frozen=True)
+class ContactScene:
+    """An object in the hand and the terrains around it.
+
+    `points_ee` are outline points in the end-effector frame [m], `terrains` the t bodies of
+    the world, `friction` the Coulomb coefficient of the object against each of them. All
+    carry the same leading batch axes.
+    """
+
+    points_ee: Float[Tensor, "*batch p 2"]
+    terrains: tuple[Terrain, ...]
+    friction: Float[Tensor, "*batch t"]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading axes of the scene."""
+        return self.friction.shape[:-1]
+
+    def double(self) -> ContactScene:
+        """The same scene in float64."""
+        return ContactScene(
+            self.points_ee.double(),
+            tuple(body.double() for body in self.terrains),
+            self.friction.double(),
+        )
+
+    def gather(self, index: Int[Tensor, "*batch"]) -> ContactScene:
+        """The scenes at positions `index` of the flattened batch."""
+        points = self.points_ee
+        return ContactScene(
+            points_ee=points.reshape(-1, *points.shape[-2:])[index],
+            terrains=tuple(body.gather(index) for body in self.terrains),
+            friction=self.friction.reshape(-1, self.friction.shape[-1])[index],
+        )
+
+
+@dataclass(frozen=True)
+class ContactFrame:
+    """Chosen points against one terrain at a given pose, c contacts for each element.
+
+    `gap` [m]; `normal_row` and `tangent_row` are the derivatives of the gap and of the
+    tangential position with respect to the pose, so also the wrench of a unit force.
+    """
+
+    gap: Float[Tensor, "*batch c"]
+    normal_row: Float[Tensor, "*batch c 3"]
+    tangent_row: Float[Tensor, "*batch c 3"]
+    points_world: Float[Tensor, "*batch c 2"]
+    tangent: Float[Tensor, "*batch c 2"]
+
+
+def place_points(
+    points_object: Float[Tensor, "*batch p 2"],
+    scale: Float[Tensor, "*batch"],
+    mount: Float[Tensor, "*batch 3"],
+) -> Float[Tensor, "*batch p 2"]:
+    """Outline points in the end-effector frame [m]: scaled, then moved by the mount."""
+    return transform_points(mount, scale[..., None, None] * points_object)
+
+
+def scene_from_parameters(shape: Shape, parameters: Parameters) -> ContactScene:
+    """The scene that theta describes: decoded outline, floor and wall, one friction for both."""
+    points = shape.boundary_points(parameters.latent)
+    friction = parameters.friction[..., None]
+    return ContactScene(
+        points_ee=place_points(points, parameters.scale, parameters.mount),
+        terrains=(floor(parameters.floor_height), wall(parameters.wall_position)),
+        friction=torch.cat((friction, friction), dim=-1),
+    )
+
+
+def terrain_gaps(
+    points_ee: Float[Tensor, "*batch p 2"],
+    terrains: tuple[Terrain, ...],
+    pose: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch t p"], Float[Tensor, "*batch t p"]]:
+    """Gap of every outline point to every terrain [m], and its derivative by the angle [m/rad]."""
+    points_world = transform_points(pose, points_ee)
+    turned = perpendicular(points_world - pose[..., None, :2])
+    gaps, levers = [], []
+    for body in terrains:
+        gaps.append(body.signed_distance(points_world))
+        levers.append((body.normal(points_world) * turned).sum(-1))
+    return torch.stack(gaps, dim=-2), torch.stack(levers, dim=-2)
+
+
+def contact_frame(
+    points_ee: Float[Tensor, "*batch p 2"],
+    terrain: Terrain,
+    pose: Float[Tensor, "*batch 3"],
+    index: Int[Tensor, "*batch c"],
+) -> ContactFrame:
+    """Gaps, frames and Jacobian rows of the points `index` against one terrain."""
+    chosen = torch.gather(points_ee, -2, index[..., None].expand(*index.shape, 2))
+    arm = rotate(pose[..., None, 2], chosen)
+    points_world = arm + pose[..., None, :2]
+    normal = terrain.normal(points_world)
+    # The normal points out of the terrain; the tangent completes a right-handed pair, so
+    # that on the floor it points along +x and on the wall along +z.
+    tangent = -perpendicular(normal)
+    return ContactFrame(
+        gap=terrain.signed_distance(points_world),
+        normal_row=_row(normal, arm),
+        tangent_row=_row(tangent, arm),
+        points_world=points_world,
+        tangent=tangent,
+    )
+
+
+def _row(direction: Tensor, arm: Tensor) -> Tensor:
+    moment = (direction * perpendicular(arm)).sum(-1, keepdim=True)
+    return torch.cat((direction, moment), dim=-1)

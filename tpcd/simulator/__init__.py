@@ -1,0 +1,20 @@
+"""The quasi-static simulator f_theta(x, u) and its records."""
+
+from tpcd.simulator.record import (
+    ContactMode,
+    ContactSet,
+    StepSettings,
+    StepStatus,
+    Transition,
+)
+from tpcd.simulator.step import rollout, simulate_step
+
+__all__ = [
+    "ContactMode",
+    "ContactSet",
+    "StepSettings",
+    "StepStatus",
+    "Transition",
+    "rollout",
+    "simulate_step",
+]

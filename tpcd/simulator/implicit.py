@@ -1,0 +1,171 @@
+"""Derivatives of the settled pose by the implicit function theorem.
+
+At rest the pose x' and the multipliers of the loaded contact rows solve
+
+    K (x' - u) - B(x')^T lambda = 0,      c_j(x', start) = 0 for every loaded row j,
+
+where B holds the force directions (n + s mu t) of the contacts as wrenches, and c_j is the
+gap alone for a point that slips under Coulomb friction, or gap + s mu slip otherwise. One
+Newton step on this system, taken at the solution with its matrix held fixed, changes no
+value but carries exact first derivatives with respect to everything that enters the
+residual: theta through the outline points, start, command and stiffness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.contact import ContactFrame, ContactScene, contact_frame
+from tpcd.planar import rotate
+from tpcd.simulator.record import ContactSet, StepSettings
+
+
+@dataclass(frozen=True)
+class LinearResponse:
+    """First-order change of the settled pose with start, command and the gap of each terrain."""
+
+    start: Float[Tensor, "b 3 3"]
+    command: Float[Tensor, "b 3 3"]
+    gap: Float[Tensor, "b t 3"]
+
+
+@dataclass(frozen=True)
+class _System:
+    """The equations at the solution: residuals, rows, and the 3 x 3 Schur complement."""
+
+    force_residual: Tensor
+    row_residual: Tensor
+    constraint: Tensor
+    force: Tensor
+    inverse_stiffness: Tensor
+    schur: Tensor
+    loaded: Tensor
+    start_row: Tensor
+
+
+def newton_pose(
+    scene: ContactScene,
+    start: Float[Tensor, "b 3"],
+    command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, " 3"],
+    pose: Float[Tensor, "b 3"],
+    contacts: ContactSet,
+    settings: StepSettings,
+) -> Float[Tensor, "b 3"]:
+    """The settled pose again, now carrying derivatives."""
+    system = _system(scene, start, command, stiffness, pose, contacts, settings)
+    step = _solve(system, -system.force_residual, -system.row_residual)
+    return pose.detach() + step
+
+
+def linear_response(
+    scene: ContactScene,
+    start: Float[Tensor, "b 3"],
+    command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, " 3"],
+    pose: Float[Tensor, "b 3"],
+    contacts: ContactSet,
+    settings: StepSettings,
+) -> LinearResponse:
+    """Derivatives of the settled pose in closed form, for propagating noise."""
+    with torch.no_grad():
+        system = _system(scene, start, command, stiffness, pose, contacts, settings)
+        zero_force = torch.zeros_like(system.force_residual)
+        columns = []
+        for axis in range(3):
+            columns.append(_solve(system, zero_force, -system.start_row[..., axis]))
+        for axis in range(3):
+            push = torch.zeros_like(zero_force)
+            push[:, axis] = stiffness[axis]
+            columns.append(_solve(system, push, torch.zeros_like(system.row_residual)))
+        gap = []
+        for t in range(len(scene.terrains)):
+            here = ((contacts.terrain == t) & system.loaded).to(pose.dtype)
+            gap.append(_solve(system, zero_force, -here))
+        return LinearResponse(
+            start=torch.stack(columns[:3], dim=-1),
+            command=torch.stack(columns[3:], dim=-1),
+            gap=torch.stack(gap, dim=-2),
+        )
+
+
+def _system(
+    scene: ContactScene,
+    start: Tensor,
+    command: Tensor,
+    stiffness: Tensor,
+    pose: Tensor,
+    contacts: ContactSet,
+    settings: StepSettings,
+) -> _System:
+    pose, multiplier = pose.detach(), contacts.multiplier.detach()
+    loaded = multiplier > 0
+    now = _frames(scene, pose, contacts)
+    before = _frames(scene, start, contacts)
+    friction = torch.gather(scene.friction, -1, contacts.terrain)
+    slope = contacts.side * friction
+    slip = ((now.points_world - before.points_world) * now.tangent.detach()).sum(-1)
+    force = now.normal_row + slope[..., None] * now.tangent_row
+    held = ~contacts.slipping if settings.friction == "coulomb" else torch.ones_like(loaded)
+    drag = torch.where(held, slope, 0.0)
+    load = _same_terrain(contacts, loaded) * settings.compliance
+    row_residual = now.gap + drag * slip + (load * multiplier[..., None, :]).sum(-1)
+    force_residual = stiffness * (pose - command) - (multiplier[..., None] * force).sum(-2)
+    constraint = (now.normal_row + drag[..., None] * now.tangent_row).detach()
+    return _System(
+        force_residual=force_residual,
+        row_residual=torch.where(loaded, row_residual, 0.0),
+        constraint=constraint,
+        force=force.detach(),
+        inverse_stiffness=1.0 / _effective_stiffness(scene, pose, stiffness, contacts, force),
+        schur=load,
+        loaded=loaded,
+        start_row=-(drag[..., None] * before.tangent_row * loaded[..., None]).detach(),
+    )
+
+
+def _solve(system: _System, force: Tensor, row: Tensor) -> Tensor:
+    """Pose change for right-hand sides of the force balance and of the rows."""
+    weighted = system.constraint * system.inverse_stiffness[..., None, :]
+    both = system.loaded[..., :, None] & system.loaded[..., None, :]
+    matrix = torch.where(both, weighted @ system.force.mT + system.schur, 0.0)
+    matrix = matrix + torch.diag_embed((~system.loaded).to(matrix.dtype))
+    right = torch.where(system.loaded, row - (weighted * force[..., None, :]).sum(-1), 0.0)
+    multiplier, failed = torch.linalg.solve_ex(matrix, right)
+    multiplier = torch.where((failed == 0)[..., None], multiplier, 0.0)
+    push = force + (multiplier[..., None] * system.force).sum(-2)
+    return system.inverse_stiffness * push
+
+
+def _effective_stiffness(
+    scene: ContactScene, pose: Tensor, stiffness: Tensor, contacts: ContactSet, force: Tensor
+) -> Tensor:
+    """Diagonal of K minus the turning of the contact forces' arms with the angle."""
+    index = contacts.point[..., None].expand(*contacts.point.shape, 2)
+    arm = rotate(pose[..., None, 2], torch.gather(scene.points_ee, -2, index))
+    turning = (contacts.multiplier * (force[..., :2] * arm).sum(-1)).sum(-1)
+    zero = torch.zeros_like(turning)
+    return (stiffness + torch.stack((zero, zero, turning), dim=-1)).detach()
+
+
+def _frames(scene: ContactScene, pose: Tensor, contacts: ContactSet) -> ContactFrame:
+    """Contact frames of the loaded rows, each against its own terrain."""
+    frames = [contact_frame(scene.points_ee, body, pose, contacts.point) for body in scene.terrains]
+    merged = {}
+    for name in ("gap", "normal_row", "tangent_row", "points_world", "tangent"):
+        value = getattr(frames[0], name)
+        for t, frame in enumerate(frames[1:], start=1):
+            here = contacts.terrain == t
+            here = here if value.ndim == here.ndim else here[..., None]
+            value = torch.where(here, getattr(frame, name), value)
+        merged[name] = value
+    return ContactFrame(**merged)
+
+
+def _same_terrain(contacts: ContactSet, loaded: Tensor) -> Tensor:
+    same = contacts.terrain[..., :, None] == contacts.terrain[..., None, :]
+    return (same & loaded[..., :, None] & loaded[..., None, :]).to(contacts.multiplier.dtype)

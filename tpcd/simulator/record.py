@@ -1,0 +1,111 @@
+"""What goes into a quasi-static step and what comes out of it.
+
+`StepSettings` are the choices of the simulator, `ContactSet` the contacts that carry load
+at the solution (at most three, as the plane has three degrees of freedom) and `Transition`
+the answer for each element of the batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+MAX_LOADED = 3
+"""Most contacts rows that can be active at once: the number of degrees of freedom."""
+
+
+class StepStatus(IntEnum):
+    """How the quasi-static step of one element ended."""
+
+    CONVERGED = 0, "converged"
+    NOT_CONVERGED = 1, "the iterations did not settle; raise rounds or substeps"
+    RELAXED = 2, "no rigid solution (the object is jammed); answered by the elastic fallback"
+    INVALID_INPUT = 3, "the pose, command or scene holds a NaN or an infinity"
+
+    sentence: str
+
+    def __new__(cls, value: int, sentence: str) -> StepStatus:
+        """An integer that carries the sentence a user reads."""
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+
+class ContactMode(IntEnum):
+    """State of the contact with one terrain at the end of a step."""
+
+    FREE = 0
+    STICK = 1
+    SLIP_POSITIVE = 2
+    SLIP_NEGATIVE = 3
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """Choices of the quasi-static simulator."""
+
+    friction: Literal["coulomb", "anitescu"] = "coulomb"
+    """`anitescu` is the convex relaxation (a sliding body is lifted by friction x slip);
+    `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
+    substeps: int = 1
+    """The command is approached in this many equal parts; more follow the path of friction."""
+    rounds: int = 20
+    """Cap on re-linearisations of geometry and friction in one substep."""
+    tolerance: float = 1e-7
+    """A substep has settled when a round moves no point by more than this [m]."""
+    compliance: float = 0.0
+    """Normal compliance of every terrain [m/N]; 0 is rigid."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that mean nothing."""
+        if self.friction not in ("coulomb", "anitescu"):
+            raise ValueError(f"friction is {self.friction!r}, expected 'coulomb' or 'anitescu'")
+        if self.substeps < 1 or self.rounds < 1:
+            raise ValueError(
+                f"substeps {self.substeps} and rounds {self.rounds} must both be at least 1"
+            )
+        if self.compliance < 0 or self.tolerance <= 0:
+            raise ValueError(
+                f"compliance {self.compliance} must be >= 0 and tolerance {self.tolerance} > 0"
+            )
+
+
+@dataclass(frozen=True)
+class ContactSet:
+    """The contact rows that carry load, padded to three with multiplier 0.
+
+    Row j says gap + side x friction x slip >= 0 for outline point `point` against terrain
+    `terrain`; `slipping` tells whether the point moves along the terrain.
+    """
+
+    multiplier: Float[Tensor, "*batch 3"]
+    point: Int[Tensor, "*batch 3"]
+    terrain: Int[Tensor, "*batch 3"]
+    side: Float[Tensor, "*batch 3"]
+    slipping: Bool[Tensor, "*batch 3"]
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Answer of one step for each element.
+
+    `pose` (x, z, angle) [m, m, rad]; `wrench` (F_x, F_z, torque) [N, N, N·m] that the world
+    exerts on the object about the end-effector origin; `mode` the `ContactMode` against each
+    terrain; `residual` the largest remaining motion or penetration of the last round [m].
+    `pose_from_start` is the derivative of the settled pose with respect to the start pose,
+    `pose_from_gap` with respect to the gap of each terrain (row t: how the pose moves when
+    everything that touches terrain t lies further out by one metre, negative outwards).
+    """
+
+    pose: Float[Tensor, "*batch 3"]
+    wrench: Float[Tensor, "*batch 3"]
+    mode: Int[Tensor, "*batch t"]
+    status: Int[Tensor, "*batch"]
+    residual: Float[Tensor, "*batch"]
+    pose_from_start: Float[Tensor, "*batch 3 3"]
+    pose_from_gap: Float[Tensor, "*batch t 3"]

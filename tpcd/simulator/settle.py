@@ -1,0 +1,205 @@
+"""One quasi-static substep for a flat batch: find the pose at which the arm comes to rest.
+
+The pose x' minimises 1/2 (x' - u)^T K (x' - u) subject to, for every outline point i, every
+terrain and both sides s = +1, -1,
+
+    gap_i(x') + s mu slip_i(x') + mu sigma_i + c load >= 0,
+
+slip being the tangential motion of the point since the start of the substep. With
+sigma = 0 this is the convex friction of Anitescu (2006); sigma = |slip|, found as a fixed
+point, is Coulomb friction (De Saxce and Feng 1998). `load` is the normal force on that
+terrain and c its compliance. Each round re-linearises everything at the last solution, so
+the answer holds for the turned outline and not only for its first linearisation. This
+file works on tensors of any device; `native` is the same in compiled loops.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tpcd.contact import ContactScene, contact_frame, terrain_gaps
+from tpcd.qp import ContactQP, Status, solve
+from tpcd.simulator.record import MAX_LOADED, ContactSet, StepSettings, StepStatus
+
+PROBE_ANGLE = 0.02
+"""Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
+SLOTS = 3 + MAX_LOADED
+"""Candidate points for each terrain: lowest now, lowest when turned either way, last loaded."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Result of one substep on a flat batch of b elements."""
+
+    pose: Float[Tensor, "b 3"]
+    contacts: ContactSet
+    status: Int[Tensor, " b"]
+    residual: Float[Tensor, " b"]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Constraint rows of all candidates, r = terrains x slots x two sides."""
+
+    jacobian: Tensor
+    offset: Tensor
+    point: Tensor
+    terrain: Tensor
+    side: Tensor
+    slip: Tensor
+
+
+def settle(
+    scene: ContactScene,
+    start: Float[Tensor, "b 3"],
+    command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, " 3"],
+    settings: StepSettings,
+) -> Settled:
+    """Rest pose and loaded contacts for each element; no gradient is recorded."""
+    with torch.no_grad():
+        return _settle(scene, start, command, stiffness, settings)
+
+
+def _settle(
+    scene: ContactScene, start: Tensor, command: Tensor, stiffness: Tensor, settings: StepSettings
+) -> Settled:
+    count, terrains = scene.friction.shape
+    device = start.device
+    pose = start.clone()
+    residual = torch.full_like(start[:, 0], torch.inf)
+    status = torch.full((count,), int(StepStatus.NOT_CONVERGED), device=device)
+    contacts = _no_contacts(count, start)
+    load = start.new_zeros(count, terrains)
+    extent = scene.points_ee.norm(dim=-1).amax(-1)
+    finite = _finite(scene, start, command)
+    status[~finite] = int(StepStatus.INVALID_INPUT)
+    running = torch.nonzero(finite).flatten()
+    for _ in range(settings.rounds):
+        if len(running) == 0:
+            break
+        part = scene.gather(running)
+        rows = _candidate_rows(
+            part, start[running], pose[running], _take(contacts, running), load[running], settings
+        )
+        step, found, relaxed = _solve_rows(
+            rows, command[running] - pose[running], stiffness, settings.tolerance
+        )
+        pose[running] += step
+        _put(contacts, running, found)
+        load[running] = _terrain_load(found, terrains)
+        change = step[:, :2].abs().amax(-1) + step[:, 2].abs() * extent[running]
+        residual[running] = change
+        settled = change <= settings.tolerance
+        # An element that was relaxed stays flagged only if its last round was.
+        status[running] = torch.where(
+            relaxed,
+            int(StepStatus.RELAXED),
+            torch.where(settled, int(StepStatus.CONVERGED), int(StepStatus.NOT_CONVERGED)),
+        )
+        running = running[~settled]
+    pose[~finite] = torch.nan
+    return Settled(pose, contacts, status, residual)
+
+
+def _candidate_rows(
+    scene: ContactScene,
+    start: Tensor,
+    pose: Tensor,
+    loaded: ContactSet,
+    load: Tensor,
+    settings: StepSettings,
+) -> _Rows:
+    """Linearise gap and slip at `pose` for the points that could carry load."""
+    gaps, levers = terrain_gaps(scene.points_ee, scene.terrains, pose)
+    parts = []
+    for t, body in enumerate(scene.terrains):
+        index = _candidates(gaps[:, t], levers[:, t], loaded, t)
+        now = contact_frame(scene.points_ee, body, pose, index)
+        before = contact_frame(scene.points_ee, body, start, index)
+        friction = scene.friction[:, t, None]
+        slip = ((now.points_world - before.points_world) * now.tangent).sum(-1)
+        lift = friction * slip.abs() if settings.friction == "coulomb" else 0.0
+        sink = settings.compliance * load[:, t, None]
+        for side in (1.0, -1.0):
+            parts.append(
+                _Rows(
+                    jacobian=now.normal_row + side * friction[..., None] * now.tangent_row,
+                    offset=now.gap + side * friction * slip + lift + sink,
+                    point=index,
+                    terrain=torch.full_like(index, t),
+                    side=torch.full_like(slip, side),
+                    slip=slip,
+                )
+            )
+    names = ("jacobian", "offset", "point", "terrain", "side", "slip")
+    return _Rows(**{name: torch.cat([getattr(p, name) for p in parts], dim=1) for name in names})
+
+
+def _candidates(gap: Tensor, lever: Tensor, loaded: ContactSet, terrain: int) -> Tensor:
+    """Indices (b, SLOTS) of the points that touch first as the object sinks or turns."""
+    fresh = [
+        (gap + angle * lever).argmin(-1, keepdim=True)
+        for angle in (0.0, PROBE_ANGLE, -PROBE_ANGLE)
+    ]
+    here = (loaded.terrain == terrain) & (loaded.multiplier > 0)
+    kept = torch.where(here, loaded.point, fresh[0])
+    return torch.cat((*fresh, kept), dim=-1)
+
+
+def _solve_rows(
+    rows: _Rows, target: Tensor, stiffness: Tensor, tolerance: float
+) -> tuple[Tensor, ContactSet, Tensor]:
+    """Motion to the minimum, the contacts loaded there, and which elements were relaxed."""
+    solution = solve(
+        ContactQP(
+            hessian=torch.diag(stiffness),
+            target=target,
+            rows=rows.jacobian,
+            offsets=rows.offset,
+        )
+    )
+    multiplier, order = torch.topk(solution.multipliers, MAX_LOADED, dim=-1)
+    slip = rows.slip.gather(1, order)
+    contacts = ContactSet(
+        multiplier=multiplier,
+        point=rows.point.gather(1, order),
+        terrain=rows.terrain.gather(1, order),
+        side=rows.side.gather(1, order),
+        slipping=(multiplier > 0) & (slip.abs() > 10 * tolerance),
+    )
+    return solution.motion, contacts, solution.status == int(Status.RELAXED)
+
+
+def _terrain_load(contacts: ContactSet, terrains: int) -> Tensor:
+    """Normal force on each terrain [N]: every row of a contact pushes with its multiplier."""
+    load = contacts.multiplier.new_zeros(len(contacts.multiplier), terrains)
+    return load.scatter_add(1, contacts.terrain, contacts.multiplier)
+
+
+def _no_contacts(count: int, like: Tensor) -> ContactSet:
+    zeros = like.new_zeros(count, MAX_LOADED)
+    index = torch.zeros(count, MAX_LOADED, dtype=torch.long, device=like.device)
+    return ContactSet(zeros, index, index.clone(), zeros.clone(), index.bool())
+
+
+def _take(contacts: ContactSet, index: Tensor) -> ContactSet:
+    return ContactSet(*(getattr(contacts, name)[index] for name in _CONTACT_FIELDS))
+
+
+def _put(contacts: ContactSet, index: Tensor, values: ContactSet) -> None:
+    for name in _CONTACT_FIELDS:
+        getattr(contacts, name)[index] = getattr(values, name)
+
+
+def _finite(scene: ContactScene, start: Tensor, command: Tensor) -> Tensor:
+    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
+    finite = torch.isfinite(gaps).flatten(1).all(-1) & torch.isfinite(start).all(-1)
+    return finite & torch.isfinite(command).all(-1) & torch.isfinite(scene.friction).all(-1)
+
+
+_CONTACT_FIELDS = ("multiplier", "point", "terrain", "side", "slipping")

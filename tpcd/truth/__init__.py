@@ -1,0 +1,1 @@
+"""Where simulated episodes come from: independent truths, scenes, motions."""

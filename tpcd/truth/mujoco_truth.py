@@ -1,0 +1,193 @@
+"""Independent truth: a rigid outline under an impedance controller, by MuJoCo.
+
+MuJoCo integrates second-order dynamics with its own contact solver; nothing here comes
+from the quasi-static model it is compared with. The object is a body with two slides and
+a hinge, its hull vertices are spheres of 1 µm, floor and wall are planes set back by that
+radius, and three position actuators are the impedance K. Each command is approached on a
+straight ramp and held until the arm stands still; then K (pose - command) is the wrench.
+
+Settings were tuned on closed forms (tests/test_truth_mujoco.py). Inertia and damping are K
+times one constant for every axis, since otherwise free motion bends and friction sees
+another path. A contact time constant below about 5 time steps chatters; a low impratio lets
+contact between floor and wall creep.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.errors import SolverError
+from tpcd.truth.hull import hull_vertices
+
+Transition = tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]
+
+
+@dataclass(frozen=True)
+class MujocoSettings:
+    """Numerical settings of the truth; the defaults are the tuned ones."""
+
+    time_step: float = 0.002
+    """Integration step [s]."""
+    damping_time: float = 0.3
+    """Damping over stiffness of every axis [s]: the time constant of free motion."""
+    inertia_time: float = 0.1
+    """Square root of inertia over stiffness of every axis [s]."""
+    ramp_time: float = 1.0
+    """Time in which the command moves from the last one to the next [s]."""
+    hold_time: float = 15.0
+    """Longest time the command is held for the arm to settle [s]."""
+    settled_force: float = 2e-4
+    """The arm stands still when damping carries less than this on every axis [N, N, N·m]."""
+    contact_steps: float = 7.0
+    """Contact time constant in time steps."""
+    impedance: float = 0.99
+    """Contact impedance d of MuJoCo's soft constraints; sets the penetration at rest."""
+    noslip_iterations: int = 10
+    """Iterations of the solver that removes slip left by the soft friction."""
+
+
+class MujocoTruth:
+    """One outline in one scene, simulated by MuJoCo; keeps its state between steps.
+
+    `outline_vertices_ee` are the outline's vertices, scaled and mounted, in the
+    end-effector frame [m]; floor height and wall position are world z and x [m]; stiffness
+    is the diagonal of K [N/m, N/m, N·m/rad]. Raises `SolverError` where mujoco is not
+    installed and `ValueError` for values without meaning.
+    """
+
+    def __init__(
+        self,
+        outline_vertices_ee: Float[Tensor, "p 2"],
+        friction: float,
+        floor_height: float,
+        wall_position: float,
+        stiffness: Float[Tensor, " 3"],
+        settings: MujocoSettings | None = None,
+    ) -> None:
+        if friction < 0:
+            raise ValueError(f"friction is {friction}, expected >= 0")
+        if not bool((stiffness > 0).all()):
+            raise ValueError(f"stiffness is {stiffness.tolist()}, expected > 0 on every axis")
+        self.settings = settings or MujocoSettings()
+        self._mujoco = _load_mujoco()
+        self._stiffness = stiffness.detach().numpy().astype(np.float64)
+        hull = hull_vertices(outline_vertices_ee.detach().numpy().astype(np.float64))
+        xml = _scene_xml(
+            hull, friction, floor_height, wall_position, self._stiffness, self.settings
+        )
+        self._model = self._mujoco.MjModel.from_xml_string(xml)
+        self._data = self._mujoco.MjData(self._model)
+        self._command = np.zeros(3)
+        self.reset(torch.zeros(3, dtype=torch.float64))
+
+    def reset(self, pose: Float[Tensor, " 3"]) -> None:
+        """Put the arm at rest at a pose with the command equal to it [m, m, rad]."""
+        self._mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = pose.numpy()
+        self._command = self._data.qpos.copy()
+
+    def step(self, command: Float[Tensor, " 3"]) -> Transition:
+        """Ramp from the last command to this one and hold until the arm stands still.
+
+        Returns pose [m, m, rad], wrench K (pose - command) [N, N, N·m] and whether the arm
+        settled within `hold_time`.
+        """
+        mujoco, model, data, settings = self._mujoco, self._model, self._data, self.settings
+        start, end = self._command, command.numpy().astype(np.float64)
+        ramp_steps = max(1, round(settings.ramp_time / settings.time_step))
+        for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
+            data.ctrl[:] = start + fraction * (end - start)
+            mujoco.mj_step(model, data)
+        damping = self._stiffness * settings.damping_time
+        block = max(1, round(0.05 / settings.time_step))
+        settled = False
+        for _ in range(max(1, round(settings.hold_time / settings.time_step / block))):
+            before = data.qpos.copy()
+            mujoco.mj_step(model, data, block)
+            # The mean speed over the block, so that a chattering contact counts as at rest.
+            speed = np.abs(data.qpos - before) / (block * settings.time_step)
+            if (damping * speed).max() < settings.settled_force:
+                settled = True
+                break
+        self._command = end
+        pose = data.qpos.copy()
+        wrench = self._stiffness * (pose - end)
+        return torch.from_numpy(pose), torch.from_numpy(wrench), settled
+
+    def step_from(self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]) -> Transition:
+        """One transition from rest at `pose`, the command starting there; see `step`."""
+        self.reset(pose)
+        return self.step(command)
+
+    def contact_wrench(self) -> Float[Tensor, " 3"]:
+        """Wrench summed from the contact forces of the last step; `step` gives K (x' - u)."""
+        self._mujoco.mj_forward(self._model, self._data)
+        return torch.from_numpy(self._data.qfrc_constraint.copy())
+
+
+def _load_mujoco() -> ModuleType:
+    try:
+        import mujoco
+    except ImportError as error:
+        raise SolverError(
+            "mujoco is not installed, needed for the independent truth;"
+            " pip install 'tpcd[dev]' or use --truth quasistatic"
+        ) from error
+    return mujoco
+
+
+def _scene_xml(
+    hull: np.ndarray,
+    friction: float,
+    floor_height: float,
+    wall_position: float,
+    stiffness: np.ndarray,
+    settings: MujocoSettings,
+) -> str:
+    """The model as MuJoCo XML; MuJoCo's x and z are ours, and phi turns about -y."""
+    radius = 1e-6
+    contact = (
+        f'condim="3" friction="{friction!r} 0 0" '
+        f'solref="{settings.contact_steps * settings.time_step!r} 1" '
+        f'solimp="{settings.impedance!r} {settings.impedance!r} 0.001"'
+    )
+    joints, actuators = [], []
+    for name, kind, axis, value in zip(
+        ("x", "z", "phi"), ("slide", "slide", "hinge"), ("1 0 0", "0 0 1", "0 -1 0"),
+        stiffness.tolist(), strict=True,
+    ):  # fmt: skip
+        joints.append(
+            f'<joint name="{name}" type="{kind}" axis="{axis}"'
+            f' damping="{value * settings.damping_time!r}"'
+            f' armature="{value * settings.inertia_time**2!r}"/>'
+        )
+        actuators.append(f'<position joint="{name}" kp="{value!r}"/>')
+    spheres = "".join(
+        f'<geom type="sphere" size="{radius!r}" pos="{x!r} 0 {z!r}" {contact}'
+        ' contype="1" conaffinity="0"/>'
+        for x, z in hull.tolist()
+    )
+    plane = f'type="plane" size="1 1 1" {contact} contype="0" conaffinity="1"'
+    return f"""
+    <mujoco>
+      <compiler angle="radian"/>
+      <option timestep="{settings.time_step!r}" gravity="0 0 0" integrator="implicitfast"
+              cone="elliptic" impratio="1e4" solver="Newton" iterations="100" tolerance="1e-12"
+              noslip_iterations="{settings.noslip_iterations}" noslip_tolerance="1e-12"/>
+      <worldbody>
+        <geom {plane} pos="0 0 {floor_height - radius!r}" zaxis="0 0 1"/>
+        <geom {plane} pos="{wall_position + radius!r} 0 0" zaxis="-1 0 0"/>
+        <body>
+          <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>
+          {"".join(joints)}
+          {spheres}
+        </body>
+      </worldbody>
+      <actuator>{"".join(actuators)}</actuator>
+    </mujoco>"""

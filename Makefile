@@ -50,7 +50,9 @@ $(INSTALLED): pins.txt pyproject.toml
 	  if [ -n "$$python" ] && [ "$$python" = "$(PYTHON)" ]; then break; fi; \
 	done; \
 	if [ -z "$$found" ]; then \
-	  echo "tpcd needs Python 3.10, 3.11 or 3.12 with venv; $${python:-python3} is $$("$$python" --version 2>&1 || echo missing)." \
+	  python="$(or $(PYTHON),python3)"; \
+	  version=$$("$$python" --version 2>/dev/null) || version="not usable"; \
+	  echo "tpcd needs Python 3.10, 3.11 or 3.12 with venv; $$python is $$version." \
 	    "Install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; \
 	fi; \
 	echo "Setting up .venv with $$("$$found" --version) (a few minutes the first time)"; \

@@ -1,0 +1,65 @@
+"""Options, tolerances and type checks shared by all tests.
+
+Shapes and types written on tpcd's signatures are checked while the tests run, by
+jaxtyping with beartype; this must be set before anything imports tpcd.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jaxtyping
+import pytest
+
+jaxtyping.install_import_hook("tpcd", "beartype.beartype")
+
+import torch  # noqa: E402
+
+torch.set_num_threads(1)
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Absolute and relative tolerance, in the form `torch.testing.assert_close` takes."""
+
+    atol: float
+    rtol: float
+
+
+TOLERANCES = {
+    torch.float32: Tolerance(atol=1e-5, rtol=1e-5),
+    torch.float64: Tolerance(atol=1e-10, rtol=1e-10),
+}
+"""The one table dtype -> tolerances."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options that choose device and dtype."""
+    parser.addoption("--device", default="cpu", help="torch device for tests that take one")
+    parser.addoption(
+        "--dtype", default="float64", choices=("float32", "float64"), help="dtype of such tests"
+    )
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """The device given by --device."""
+    return torch.device(request.config.getoption("--device"))
+
+
+@pytest.fixture
+def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+    """The dtype given by --dtype."""
+    return getattr(torch, request.config.getoption("--dtype"))
+
+
+@pytest.fixture
+def tolerance(dtype: torch.dtype) -> dict[str, float]:
+    """Tolerances for --dtype, as keyword arguments of `torch.testing.assert_close`."""
+    return {"atol": TOLERANCES[dtype].atol, "rtol": TOLERANCES[dtype].rtol}
+
+
+@pytest.fixture
+def tolerances() -> dict[torch.dtype, Tolerance]:
+    """The whole table dtype -> tolerances, for tests that use several dtypes."""
+    return TOLERANCES

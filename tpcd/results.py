@@ -1,0 +1,272 @@
+"""Result folders: what was run, with which configuration and versions, and what came out.
+
+A run folder holds `config.yaml` (the resolved configuration, readable by `--config`),
+`versions.json` (command, date, git revision, packages, hardware) and, once the work is
+done, `results.json` (the printed table with all of that). Files are written under a
+temporary name and moved into place. JSON has no NaN: such a value is stored as null and
+its place listed under `non_finite`. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from tpcd import __version__
+from tpcd.errors import FileError, RunError
+
+CONFIG_FILE = "config.yaml"
+VERSIONS_FILE = "versions.json"
+RESULTS_FILE = "results.json"
+PACKAGES = (
+    "torch",
+    "numpy",
+    "scipy",
+    "lightning",
+    "shapely",
+    "trimesh",
+    "jsonargparse",
+    "numba",
+    "qpth",
+    "mujoco",
+    "daqp",
+    "osqp",
+    "clarabel",
+)
+
+
+def open_run(
+    path: str | Path, command: str, config: Mapping[str, Any] | Any, overwrite: bool = False
+) -> Path:
+    """Make a run folder that says what is about to run, and return it.
+
+    `command` names the program (`scripts/estimate.py`), `config` is its dataclass or a
+    mapping. Raises `RunError` when the folder already holds something; with `overwrite`
+    an earlier run there is removed, but never a folder that is not a run.
+    """
+    import yaml
+
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise RunError(folder, "is a file", "name a folder for the results")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not overwrite:
+            raise RunError(folder, "is not empty", "name a new folder or pass --overwrite")
+        if not (folder / VERSIONS_FILE).is_file():
+            raise RunError(
+                folder, f"is not a run (no {VERSIONS_FILE}), not overwritten", "name a new folder"
+            )
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    body = yaml.safe_dump(to_plain(config), sort_keys=False, allow_unicode=True)
+    _write_text(folder / CONFIG_FILE, f"# {command}\n{body}")
+    write_json(folder / VERSIONS_FILE, {"command": command, **versions()})
+    return folder
+
+
+def write_results(
+    folder: str | Path,
+    table: Sequence[Mapping[str, Any]],
+    *,
+    seeds: Sequence[int] = (),
+    **extra: Any,
+) -> Path:
+    """Write `results.json` into an opened run: table, configuration, versions, seeds.
+
+    `table` is what was printed, one mapping for each row; `extra` adds further entries
+    beside it. Raises `RunError` when the folder was not made by `open_run`.
+    """
+    import yaml
+
+    folder = Path(folder)
+    if not (folder / CONFIG_FILE).is_file() or not (folder / VERSIONS_FILE).is_file():
+        raise RunError(folder, "is not an opened run", "make it with open_run first")
+    recorded = read_json(folder / VERSIONS_FILE)
+    content = {
+        "command": recorded.pop("command"),
+        "table": list(table),
+        **extra,
+        "seeds": list(seeds),
+        "config": yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8")),
+        "versions": recorded,
+    }
+    return write_json(folder / RESULTS_FILE, content)
+
+
+def write_json(path: str | Path, content: Any) -> Path:
+    """Write JSON in one move; NaN and infinities become null, listed under `non_finite`."""
+    flagged: list[str] = []
+    plain = to_plain(content, flagged=flagged)
+    if flagged and isinstance(plain, dict):
+        plain["non_finite"] = flagged
+    elif flagged:
+        raise ValueError(f"{path}: not finite at {', '.join(flagged)}; wrap it in a mapping")
+    text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
+    return _write_text(Path(path), text + "\n")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file; raises `FileError` when it is missing or malformed."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileError(path, "does not exist") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FileError(path, f"is not JSON ({error})") from error
+
+
+def to_plain(value: Any, *, flagged: list[str] | None = None, place: str = "") -> Any:
+    """Turn dataclasses, mappings, sequences, paths, arrays and tensors into plain values.
+
+    With a list `flagged`, numbers that are not finite become None and their place
+    (`table[0].error`) is appended to it.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        dot = "." if place else ""
+        return {
+            str(key): to_plain(entry, flagged=flagged, place=f"{place}{dot}{key}")
+            for key, entry in value.items()
+        }
+    if hasattr(value, "tolist"):  # arrays, tensors and their scalars
+        value = value.tolist()
+    if isinstance(value, (list, tuple, set, frozenset)):
+        entries = sorted(value) if isinstance(value, (set, frozenset)) else value
+        return [
+            to_plain(entry, flagged=flagged, place=f"{place}[{i}]")
+            for i, entry in enumerate(entries)
+        ]
+    if isinstance(value, float) and not math.isfinite(value) and flagged is not None:
+        flagged.append(place)
+        return None
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{place or 'value'}: cannot store a {type(value).__name__}")
+
+
+def versions() -> dict[str, Any]:
+    """What the numbers of a run depend on besides its configuration: code and machine."""
+    return {
+        "date_utc": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "tpcd": __version__,
+        "git": _git_state(),
+        "python": platform.python_version(),
+        "packages": {name: _package_version(name) for name in PACKAGES},
+        "hardware": {
+            "platform": platform.platform(),
+            "cpu": _cpu_name(),
+            "cpu_count": os.cpu_count(),
+            "torch_threads": _from_torch(lambda torch: torch.get_num_threads()),
+            "accelerator": _from_torch(
+                lambda torch: torch.cuda.get_device_name() if torch.cuda.is_available() else None
+            ),
+        },
+    }
+
+
+def format_table(
+    rows: Sequence[Mapping[str, Any]],
+    columns: Sequence[str] = (),
+    formats: Mapping[str, str] | None = None,
+) -> str:
+    """Align rows as text: a line of names, a rule, one line for each row.
+
+    `columns` chooses and orders the columns (default: all, as they first appear);
+    `formats` gives a format specification for a column, else numbers get 4 digits.
+    Numbers are set flush right, text flush left; a missing value shows as '-'.
+    """
+    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
+    formats = formats or {}
+    cells = [[_cell(row.get(name), formats.get(name)) for name in columns] for row in rows]
+    numeric = [
+        any(isinstance(row.get(name), (int, float)) for row in rows)
+        and not any(isinstance(row.get(name), str) for row in rows)
+        for name in columns
+    ]
+    widths = [max([len(name), *(len(line[i]) for line in cells)]) for i, name in enumerate(columns)]
+
+    def aligned(line: Sequence[str]) -> str:
+        return "  ".join(
+            text.rjust(width) if right else text.ljust(width)
+            for text, width, right in zip(line, widths, numeric, strict=True)
+        ).rstrip()
+
+    rule = "  ".join("-" * width for width in widths)
+    return "\n".join([aligned(list(columns)), rule, *(aligned(line) for line in cells)])
+
+
+def _cell(value: Any, specification: str | None) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if specification:
+        return format(value, specification)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _write_text(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _git_state() -> dict[str, Any] | None:
+    """Revision of the working copy this package lies in; None for an installed copy."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        revision = _git(root, "rev-parse", "HEAD")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return {"revision": revision, "dirty": bool(changed)}
+
+
+def _git(root: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(root), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+    return done.stdout.strip()
+
+
+def _package_version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _from_torch(question: Any) -> Any:
+    """Ask torch only where the command has loaded it already."""
+    torch = sys.modules.get("torch")
+    return None if torch is None else question(torch)

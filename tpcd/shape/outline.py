@@ -26,6 +26,8 @@ LARGEST_SIZE = 1.0
 """Largest plausible longer side of the bounding box [m]."""
 SMALLEST_EDGE = 1e-8
 """Vertices nearer than this to their predecessor count as the same vertex [m]."""
+METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Units of length a file with outlines can be in."""
 LARGEST_CORNER_REACH = 0.01
 """`resample` spreads the turning of a corner over at most this share of the perimeter on
 each side, so that two points never coincide."""

@@ -6,17 +6,53 @@ checked by `make_outline`: simple, counter-clockwise, centred, in metres.
 
 from __future__ import annotations
 
+import re
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from tpcd.errors import OutlineError
-from tpcd.shape.outline import Outline, make_outline
+from tpcd.shape.outline import METRES_PER_UNIT, Outline, make_outline
+from tpcd.shape.section import MESH_ENDINGS, CuttingPlane, cut_mesh, load_mesh
+from tpcd.shape.svg import load_svg
+
+SEPARATOR = re.compile(r"[,;\t ]+")
 
 
-def load_slices(path: str | Path) -> dict[str, Outline]:
-    """Outlines of an `.npz` file: one array (n, 2) [m] per outline, the key is its name.
+def load_outlines(
+    path: str | Path, *, unit: str | None = None, plane: CuttingPlane | None = None
+) -> dict[str, Outline]:
+    """Outlines of a file by name [m]: `.npz`, `.csv`, `.svg`, or a `.ply`, `.stl`, `.obj` mesh.
+
+    `unit` is the unit of the file's coordinates (m, cm, mm, in; also px for SVG); without it
+    metres are assumed, or for SVG what the drawing says. `plane` cuts a mesh; without it a
+    mesh is cut upright along its widest direction.
+
+    Raises:
+        OutlineError: the file is missing, of another kind, unreadable, or holds something that
+            is not one simple closed curve of plausible size.
+        ValueError: an unknown unit.
+    """
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending == ".svg":
+        return load_svg(path, unit=unit)
+    unit = "m" if unit is None else unit
+    if unit not in METRES_PER_UNIT:
+        raise ValueError(f"unit must be one of {', '.join(METRES_PER_UNIT)}, got {unit!r}")
+    if ending == ".npz":
+        return load_slices(path, unit=unit)
+    if ending == ".csv":
+        return {path.stem: load_polygon(path, unit=unit)}
+    if ending in MESH_ENDINGS:
+        return {path.stem: cut_mesh(load_mesh(path, unit=unit), path.stem, plane, path=path)}
+    known = ", ".join((".npz", ".csv", ".svg", *MESH_ENDINGS))
+    raise OutlineError(path, f"no outline file ('{ending}')", f"expected one of {known}")
+
+
+def load_slices(path: str | Path, *, unit: str = "m") -> dict[str, Outline]:
+    """Outlines of an `.npz` file: one array (n, 2) per outline, the key is its name.
 
     Nothing is unpickled.
 
@@ -36,7 +72,50 @@ def load_slices(path: str | Path) -> dict[str, Outline]:
         ) from None
     if not slices:
         raise OutlineError(path, "holds no arrays", "expected one (n, 2) array per outline")
-    return {
-        name: make_outline(name, points, path=path, source=path.name)
-        for name, points in slices.items()
-    }
+    outlines = {}
+    for name, points in slices.items():
+        if points.dtype.kind not in "fiu":
+            raise OutlineError(path, f"'{name}' holds {points.dtype}", "expected numbers")
+        scaled = points * METRES_PER_UNIT[unit]
+        outlines[name] = make_outline(name, scaled, path=path, source=path.name)
+    return outlines
+
+
+def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
+    """The polygon of a `.csv` file: one vertex `x, z` per row, named after the file.
+
+    A first row without numbers is a header; empty rows and rows that start with # are skipped.
+
+    Raises:
+        OutlineError: missing, no text, a row that is not two numbers (with its line), or a
+            polygon that is no outline.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        raise OutlineError(path, "not found", "give a .csv file of x, z rows") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise OutlineError(path, f"not readable as text ({error})", "give x, z rows") from None
+    points: list[list[float]] = []
+    header_seen = False
+    for number, line in enumerate(lines, start=1):
+        fields = [field for field in SEPARATOR.split(line.strip()) if field]
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            row = [float(field) for field in fields]
+        except ValueError:
+            if points or header_seen:
+                raise OutlineError(
+                    path, f"line {number} is '{line.strip()[:40]}'", "expected two numbers x, z"
+                ) from None
+            header_seen = True
+            continue
+        if len(row) != 2:
+            raise OutlineError(path, f"line {number} has {len(row)} numbers", "expected x, z")
+        points.append(row)
+    if not points:
+        raise OutlineError(path, "holds no vertices", "expected one x, z row for each")
+    scaled = np.array(points) * METRES_PER_UNIT[unit]
+    return make_outline(path.stem, scaled, path=path, source=path.name)

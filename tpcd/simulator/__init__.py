@@ -8,10 +8,12 @@ from tpcd.simulator.record import (
     Transition,
 )
 from tpcd.simulator.step import rollout, simulate_step
+from tpcd.simulator.truth import QuasistaticTruth
 
 __all__ = [
     "ContactMode",
     "ContactSet",
+    "QuasistaticTruth",
     "StepSettings",
     "StepStatus",
     "Transition",

@@ -104,8 +104,8 @@ def _system(
 ) -> _System:
     pose, multiplier = pose.detach(), contacts.multiplier.detach()
     loaded = multiplier > 0
-    now = _frames(scene, pose, contacts)
-    before = _frames(scene, start, contacts)
+    now = loaded_frames(scene, pose, contacts)
+    before = loaded_frames(scene, start, contacts)
     friction = torch.gather(scene.friction, -1, contacts.terrain)
     slope = contacts.side * friction
     slip = ((now.points_world - before.points_world) * now.tangent.detach()).sum(-1)
@@ -152,7 +152,9 @@ def _effective_stiffness(
     return (stiffness + torch.stack((zero, zero, turning), dim=-1)).detach()
 
 
-def _frames(scene: ContactScene, pose: Tensor, contacts: ContactSet) -> ContactFrame:
+def loaded_frames(
+    scene: ContactScene, pose: Float[Tensor, "b 3"], contacts: ContactSet
+) -> ContactFrame:
     """Contact frames of the loaded rows, each against its own terrain."""
     frames = [contact_frame(scene.points_ee, body, pose, contacts.point) for body in scene.terrains]
     merged = {}

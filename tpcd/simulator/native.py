@@ -1,1 +1,88 @@
-def available(): return False
+"""The quasi-static step in compiled loops: tensors in, tensors out.
+
+Used by itself on the CPU where numba is installed and no gradient is asked. The few
+elements whose contact problem has no rigid solution are answered by the torch path, which
+has the elastic fallback.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from importlib.util import find_spec
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tpcd.contact import ContactScene
+from tpcd.planar import wrap_angle
+from tpcd.simulator.record import StepSettings, StepStatus, Transition
+from tpcd.terrain import HalfPlane
+
+CHUNK = 64
+"""Fewest transitions handed to a thread at once."""
+
+
+def available() -> bool:
+    """Whether numba is installed."""
+    return find_spec("numba") is not None
+
+
+def step(
+    scene: ContactScene,
+    owner: Int[Tensor, " b"],
+    start: Float[Tensor, "b 3"],
+    command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, " 3"],
+    settings: StepSettings,
+) -> Transition:
+    """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
+    from tpcd.simulator.kernel import step_all
+
+    count, terrains = len(owner), len(scene.terrains)
+    planes = [body for body in scene.terrains if isinstance(body, HalfPlane)]
+    batch = scene.batch_shape
+    points = scene.points_ee.detach().double()
+    points = points.reshape(-1, *points.shape[-2:]).mT.contiguous()
+    normals = torch.stack([p.direction.detach().expand(*batch, 2) for p in planes], -2)
+    offsets = torch.stack([p.offset.detach().expand(batch) for p in planes], -1)
+    pose = torch.empty(count, 3, dtype=torch.float64)
+    mode = torch.empty(count, terrains, dtype=torch.int64)
+    status = torch.empty(count, dtype=torch.int64)
+    residual = torch.empty(count, dtype=torch.float64)
+    from_start = torch.empty(count, 3, 3, dtype=torch.float64)
+    from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
+    threads = torch.get_num_threads()
+    step_all(
+        points.numpy(),
+        _flat(normals, terrains, 2),
+        _flat(offsets, terrains),
+        _flat(scene.friction.detach(), terrains),
+        owner.numpy(),
+        _flat(start.detach(), 3),
+        _flat(command.detach(), 3),
+        stiffness.detach().double().numpy(),
+        settings.friction == "coulomb",
+        settings.substeps,
+        settings.rounds,
+        settings.tolerance,
+        settings.compliance,
+        max(1, min(8 * threads, math.ceil(count / CHUNK))),
+        True,
+        pose.numpy(),
+        mode.numpy(),
+        status.numpy(),
+        residual.numpy(),
+        from_start.numpy(),
+        from_gap.numpy(),
+    )
+    turn = start[:, 2].double() + wrap_angle(command[:, 2].double() - start[:, 2].double())
+    target = torch.cat((command[:, :2].double(), turn[:, None]), dim=-1)
+    wrench = stiffness.double() * (pose - target)
+    pose[:, 2] = wrap_angle(pose[:, 2])
+    return Transition(pose, wrench, mode, status, residual, from_start, from_gap)
+
+
+def _flat(tensor: Tensor, *shape: int):
+    return tensor.double().reshape(-1, *shape).contiguous().numpy()

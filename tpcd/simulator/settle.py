@@ -15,7 +15,7 @@ file works on tensors of any device; `native` is the same in compiled loops.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -23,10 +23,13 @@ from torch import Tensor
 
 from tpcd.contact import ContactScene, contact_frame, terrain_gaps
 from tpcd.qp import ContactQP, Status, solve
+from tpcd.simulator.implicit import loaded_frames, newton_pose
 from tpcd.simulator.record import MAX_LOADED, ContactSet, StepSettings, StepStatus
 
 PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
+NEWTON_ROUNDS = 6
+"""Rounds in which a Newton step on Coulomb's law is tried; later ones are plain fixed point."""
 SLOTS = 3 + MAX_LOADED
 """Candidate points for each terrain: lowest now, lowest when turned either way, last loaded."""
 
@@ -50,7 +53,6 @@ class _Rows:
     point: Tensor
     terrain: Tensor
     side: Tensor
-    slip: Tensor
 
 
 def settle(
@@ -79,7 +81,7 @@ def _settle(
     finite = _finite(scene, start, command)
     status[~finite] = int(StepStatus.INVALID_INPUT)
     running = torch.nonzero(finite).flatten()
-    for _ in range(settings.rounds):
+    for k in range(settings.rounds):
         if len(running) == 0:
             break
         part = scene.gather(running)
@@ -87,14 +89,23 @@ def _settle(
             part, start[running], pose[running], _take(contacts, running), load[running], settings
         )
         step, found, relaxed = _solve_rows(
-            rows, command[running] - pose[running], stiffness, settings.tolerance
+            rows, command[running] - pose[running], stiffness
         )
-        pose[running] += step
+        after = pose[running] + step
+        found = _with_slip(part, start[running], after, found, settings.tolerance)
         _put(contacts, running, found)
         load[running] = _terrain_load(found, terrains)
-        change = step[:, :2].abs().amax(-1) + step[:, 2].abs() * extent[running]
+        change = _motion(step, extent[running])
         residual[running] = change
         settled = change <= settings.tolerance
+        if k < NEWTON_ROUNDS:
+            polished = newton_pose(
+                part, start[running], command[running], stiffness, after, found, settings
+            )
+            # A step beyond what this round moved comes from a wrong guess of the contacts.
+            trusted = ~settled & (_motion(polished - after, extent[running]) <= 2 * change)
+            after = torch.where(trusted[:, None], polished, after)
+        pose[running] = after
         # An element that was relaxed stays flagged only if its last round was.
         status[running] = torch.where(
             relaxed,
@@ -133,10 +144,9 @@ def _candidate_rows(
                     point=index,
                     terrain=torch.full_like(index, t),
                     side=torch.full_like(slip, side),
-                    slip=slip,
                 )
             )
-    names = ("jacobian", "offset", "point", "terrain", "side", "slip")
+    names = ("jacobian", "offset", "point", "terrain", "side")
     return _Rows(**{name: torch.cat([getattr(p, name) for p in parts], dim=1) for name in names})
 
 
@@ -152,7 +162,7 @@ def _candidates(gap: Tensor, lever: Tensor, loaded: ContactSet, terrain: int) ->
 
 
 def _solve_rows(
-    rows: _Rows, target: Tensor, stiffness: Tensor, tolerance: float
+    rows: _Rows, target: Tensor, stiffness: Tensor
 ) -> tuple[Tensor, ContactSet, Tensor]:
     """Motion to the minimum, the contacts loaded there, and which elements were relaxed."""
     solution = solve(
@@ -164,15 +174,34 @@ def _solve_rows(
         )
     )
     multiplier, order = torch.topk(solution.multipliers, MAX_LOADED, dim=-1)
-    slip = rows.slip.gather(1, order)
     contacts = ContactSet(
         multiplier=multiplier,
         point=rows.point.gather(1, order),
         terrain=rows.terrain.gather(1, order),
         side=rows.side.gather(1, order),
-        slipping=(multiplier > 0) & (slip.abs() > 10 * tolerance),
+        slipping=torch.zeros_like(order, dtype=torch.bool),
     )
     return solution.motion, contacts, solution.status == int(Status.RELAXED)
+
+
+def _with_slip(
+    scene: ContactScene, start: Tensor, pose: Tensor, contacts: ContactSet, tolerance: float
+) -> ContactSet:
+    """Mark the loaded rows whose point has slipped; one held by both its sides has not."""
+    now, before = (loaded_frames(scene, at, contacts) for at in (pose, start))
+    slip = ((now.points_world - before.points_world) * now.tangent).sum(-1)
+    loaded = contacts.multiplier > 0
+    twin = (contacts.point[:, :, None] == contacts.point[:, None, :]) & (
+        contacts.terrain[:, :, None] == contacts.terrain[:, None, :]
+    )
+    twin = twin & loaded[:, :, None] & loaded[:, None, :]
+    held = twin.sum(-1) > 1
+    return replace(contacts, slipping=loaded & ~held & (slip.abs() > 10 * tolerance))
+
+
+def _motion(step: Tensor, extent: Tensor) -> Tensor:
+    """Largest motion of any point of the object under a small pose change [m]."""
+    return step[:, :2].abs().amax(-1) + step[:, 2].abs() * extent
 
 
 def _terrain_load(contacts: ContactSet, terrains: int) -> Tensor:

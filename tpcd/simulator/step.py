@@ -49,6 +49,7 @@ def simulate_step(
     owner = owner.reshape(scene.batch_shape).expand(batch).reshape(-1)
     if _use_native(engine, scene, pose, command, stiffness):
         flat = native.step(scene, owner, pose, command, stiffness, settings)
+        _relax_jammed(flat, scene, owner, pose, command, stiffness, settings)
     else:
         flat = _step(scene.gather(owner), pose, command, stiffness, settings)
     return Transition(
@@ -102,6 +103,24 @@ def _use_native(
             "use engine 'torch' or 'auto'"
         )
     return possible and engine != "torch"
+
+
+def _relax_jammed(
+    flat: Transition,
+    scene: ContactScene,
+    owner: Tensor,
+    pose: Tensor,
+    command: Tensor,
+    stiffness: Tensor,
+    settings: StepSettings,
+) -> None:
+    """Answer the elements the compiled loops found infeasible by the elastic fallback."""
+    jammed = torch.nonzero(flat.status == int(StepStatus.RELAXED)).flatten()
+    if len(jammed) == 0:
+        return
+    part = _step(scene.gather(owner[jammed]), pose[jammed], command[jammed], stiffness, settings)
+    for name in vars(part):
+        getattr(flat, name)[jammed] = getattr(part, name)
 
 
 def _step(

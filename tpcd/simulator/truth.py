@@ -1,0 +1,64 @@
+"""The quasi-static model as a source of simulated truth, with a known outline."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.contact import ContactScene
+from tpcd.simulator.record import StepSettings, StepStatus
+from tpcd.simulator.step import simulate_step
+from tpcd.terrain import floor, wall
+
+TRUTH_SETTINGS = StepSettings(friction="coulomb", substeps=10, rounds=40)
+
+
+class QuasistaticTruth:
+    """One outline in one scene under the project's own simulator; keeps its pose.
+
+    `outline_vertices_ee` are the outline's vertices, scaled and mounted, in the
+    end-effector frame [m]; floor height and wall position are world z and x [m]; stiffness
+    is the diagonal of K [N/m, N/m, N·m/rad]. The model has no memory but the pose.
+    """
+
+    def __init__(
+        self,
+        outline_vertices_ee: Float[Tensor, "p 2"],
+        friction: float,
+        floor_height: float,
+        wall_position: float,
+        stiffness: Float[Tensor, " 3"],
+        settings: StepSettings = TRUTH_SETTINGS,
+    ) -> None:
+        one = torch.ones((), dtype=torch.float64)
+        self._scene = ContactScene(
+            points_ee=outline_vertices_ee.double(),
+            terrains=(floor(floor_height * one), wall(wall_position * one)),
+            friction=torch.full((2,), friction, dtype=torch.float64),
+        )
+        self._stiffness = stiffness.double()
+        self._settings = settings
+        self._pose = torch.zeros(3, dtype=torch.float64)
+
+    def reset(self, pose: Float[Tensor, " 3"]) -> None:
+        """Put the arm at rest at a pose [m, m, rad]."""
+        self._pose = pose.double()
+
+    def step(
+        self, command: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
+        """Move to a command; settled pose, wrench [N, N, N·m] and whether it settled."""
+        pose, wrench, settled = self.step_from(self._pose, command)
+        self._pose = pose
+        return pose, wrench, settled
+
+    def step_from(
+        self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
+        """One transition from rest at a pose, leaving the state alone."""
+        result = simulate_step(
+            self._scene, pose.double(), command.double(), self._stiffness, self._settings
+        )
+        settled = bool(result.status == int(StepStatus.CONVERGED))
+        return result.pose, result.wrench, settled

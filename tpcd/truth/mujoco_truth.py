@@ -38,18 +38,24 @@ class MujocoSettings:
     """Damping over stiffness of every axis [s]: the time constant of free motion."""
     inertia_time: float = 0.1
     """Square root of inertia over stiffness of every axis [s]."""
-    ramp_time: float = 1.0
-    """Time in which the command moves from the last one to the next [s]."""
+    ramp_time: float = 2.0
+    """Time in which the command moves from the last one to the next [s]; halving it moves
+    forces by 2 mN in the mean, doubling it by 1 mN."""
     hold_time: float = 15.0
     """Longest time the command is held for the arm to settle [s]."""
     settled_force: float = 2e-4
     """The arm stands still when damping carries less than this on every axis [N, N, N·m]."""
     contact_steps: float = 7.0
     """Contact time constant in time steps."""
-    impedance: float = 0.99
-    """Contact impedance d of MuJoCo's soft constraints; sets the penetration at rest."""
+    impedance: tuple[float, float, float] = (0.9, 0.99, 2e-6)
+    """MuJoCo's contact impedance d at first touch, d at depth, and that depth [m]. Soft at
+    first touch keeps light contact (0.3 N) from chattering; stiff at depth keeps the
+    penetration at 5 N near 3 µm, which matters for the torque between floor and wall."""
+    impratio: float = 1e4
+    """Stiffness of friction over that of normal contact; 100 lets jammed contact creep."""
     noslip_iterations: int = 10
-    """Iterations of the solver that removes slip left by the soft friction."""
+    """Iterations of the solver that removes slip left by the soft friction; without effect
+    at this impratio, needed at lower ones."""
 
 
 class MujocoTruth:
@@ -152,10 +158,11 @@ def _scene_xml(
 ) -> str:
     """The model as MuJoCo XML; MuJoCo's x and z are ours, and phi turns about -y."""
     radius = 1e-6
+    light, deep, depth = settings.impedance
     contact = (
         f'condim="3" friction="{friction!r} 0 0" '
         f'solref="{settings.contact_steps * settings.time_step!r} 1" '
-        f'solimp="{settings.impedance!r} {settings.impedance!r} 0.001"'
+        f'solimp="{light!r} {deep!r} {depth!r} 0.5 2"'
     )
     joints, actuators = [], []
     for name, kind, axis, value in zip(
@@ -178,7 +185,8 @@ def _scene_xml(
     <mujoco>
       <compiler angle="radian"/>
       <option timestep="{settings.time_step!r}" gravity="0 0 0" integrator="implicitfast"
-              cone="elliptic" impratio="1e4" solver="Newton" iterations="100" tolerance="1e-12"
+              cone="elliptic" impratio="{settings.impratio!r}"
+              solver="Newton" iterations="100" tolerance="1e-12"
               noslip_iterations="{settings.noslip_iterations}" noslip_tolerance="1e-12"/>
       <worldbody>
         <geom {plane} pos="0 0 {floor_height - radius!r}" zaxis="0 0 1"/>

@@ -47,8 +47,8 @@ class ActiveSet:
     """Of the unit rows; zero on inactive rows."""
     slots: Int[Tensor, "s b"]
     """Indices of the active rows, -1 in free slots."""
-    status: Int[Tensor, "b"]
-    iterations: Int[Tensor, "b"]
+    status: Int[Tensor, " b"]
+    iterations: Int[Tensor, " b"]
 
 
 @dataclass
@@ -117,7 +117,7 @@ def solve_exact(problem: WhitenedQP, iteration_limit: int | None = None) -> Acti
     return ActiveSet(motion, multipliers, slots, status, iterations)
 
 
-def optimality_residual(problem: WhitenedQP, answer: ActiveSet) -> Float[Tensor, "b"]:
+def optimality_residual(problem: WhitenedQP, answer: ActiveSet) -> Float[Tensor, " b"]:
     """Largest violation of the optimality conditions in whitened variables and unit rows.
 
     Stationarity |w - rows^T u|, rows max(0, -slack), signs max(0, -u), complementarity

@@ -61,8 +61,8 @@ def solve_native(problem: ContactQP, iteration_limit: int | None = None) -> QPSo
     limit = 10 * (m + k) if iteration_limit is None else iteration_limit
     answer = (
         np.empty((count, n)),
-        np.empty((count, m)),
-        np.empty((count, m), np.bool_),
+        np.zeros((count, m)),
+        np.zeros((count, m), np.bool_),
         np.empty(count),
         np.empty(count, np.int64),
         np.empty(count, np.int64),
@@ -100,21 +100,19 @@ _INFEASIBLE = int(Status.INFEASIBLE)
 _ITERATION_LIMIT = int(Status.ITERATION_LIMIT)
 _INVALID = int(Status.INVALID_INPUT)
 _SQUARE_TOLERANCE = DEPENDENCE_TOLERANCE**2
+_SAFE_SQUARE = 0.25
+"""A rest longer than half its unit row has lost no digits and needs no second pass."""
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _solve_rows(rows, offsets, magnitudes, m, n, s, limit, motion, multipliers, slots, work):
     """Dual active set of m unit rows in n variables; see `solve_whitened_3` for the arrays.
 
-    There are s slots, at least min(n, m) and at most n. `work` is (s + 5, n): the dual
-    basis in its first s lines, then share, rest, correction, slot multipliers, leaving.
+    There are s slots, at least min(n, m); the first `used` hold the active rows. `work` is
+    (s + 5, n): the dual basis by slot in its first s lines, then share, rest, correction,
+    slot multipliers, leaving.
     """
     share, rest, change, force, leaving = s, s + 1, s + 2, s + 3, s + 4
-    for a in range(s):
-        slots[a] = -1
-        work[force, a] = 0.0
-        for i in range(n):
-            work[a, i] = 0.0
     for i in range(n):
         motion[i] = 0.0
     for row in range(m):
@@ -136,9 +134,8 @@ def _solve_rows(rows, offsets, magnitudes, m, n, s, limit, motion, multipliers, 
                     excess += rows[row, i] * motion[i]
                 if excess < worst:
                     taken = False
-                    for a in range(s):
-                        if slots[a] == row:
-                            taken = True
+                    for a in range(used):
+                        taken = taken or slots[a] == row
                     if not taken:
                         worst = excess
                         pending = row
@@ -149,43 +146,48 @@ def _solve_rows(rows, offsets, magnitudes, m, n, s, limit, motion, multipliers, 
             break
         steps += 1
 
+        # Split the row into a share of the active rows and the rest outside their span.
         violation = offsets[pending]
+        square = 0.0
         for i in range(n):
-            violation += rows[pending, i] * motion[i]
-            work[rest, i] = rows[pending, i]
-        for a in range(s):
-            work[share, a] = 0.0
-        # Twice, so that the rest is orthogonal to the active rows up to rounding.
-        for _ in range(2):
-            if used > 0:
-                for a in range(s):
+            entry = rows[pending, i]
+            violation += entry * motion[i]
+            square += entry * entry
+            work[rest, i] = entry
+        size = 1.0
+        if used > 0:
+            for a in range(used):
+                work[share, a] = 0.0
+            for attempt in range(2):
+                for a in range(used):
                     part = 0.0
                     for i in range(n):
                         part += work[a, i] * work[rest, i]
                     work[change, a] = part
                     work[share, a] += part
-                for a in range(s):
-                    if slots[a] >= 0:
-                        part = work[change, a]
-                        for i in range(n):
-                            work[rest, i] -= part * rows[slots[a], i]
-        square = 0.0
-        for i in range(n):
-            square += work[rest, i] * work[rest, i]
-        size = 1.0
-        for a in range(s):
-            size += abs(work[share, a])
+                for a in range(used):
+                    part = work[change, a]
+                    for i in range(n):
+                        work[rest, i] -= part * rows[slots[a], i]
+                square = 0.0
+                for i in range(n):
+                    square += work[rest, i] * work[rest, i]
+                if attempt == 0 and square > _SAFE_SQUARE:
+                    break
+            for a in range(used):
+                size += abs(work[share, a])
         independent = used < n and square > _SQUARE_TOLERANCE * size * size
 
         partial_step = np.inf
         blocking = 0
-        for a in range(s):
+        for a in range(used):
             if work[share, a] > RATIO_TOLERANCE:
                 ratio = work[force, a] / work[share, a]
                 if ratio < partial_step:
                     partial_step = ratio
                     blocking = a
-        full_step = max(-violation, 0.0) / square if independent else np.inf
+        inverse = 1.0 / square if independent else np.inf
+        full_step = max(-violation, 0.0) * inverse if independent else np.inf
         length = min(full_step, partial_step)
         if length == np.inf:
             status = _INFEASIBLE
@@ -193,74 +195,65 @@ def _solve_rows(rows, offsets, magnitudes, m, n, s, limit, motion, multipliers, 
         if independent:
             for i in range(n):
                 motion[i] += length * work[rest, i]
-        for a in range(s):
+        for a in range(used):
             work[force, a] -= length * work[share, a]
         pending_force += length
 
         if independent and full_step <= partial_step:
-            slot = -1
-            for a in range(s):
-                if slots[a] < 0 and slot < 0:
-                    slot = a
             for i in range(n):
-                work[rest, i] /= square
-            for a in range(s):
-                part = work[share, a]
-                for i in range(n):
-                    work[a, i] -= part * work[rest, i]
-            for i in range(n):
-                work[slot, i] = work[rest, i]
-            slots[slot] = pending
-            work[force, slot] = pending_force
+                entry = work[rest, i] * inverse
+                work[used, i] = entry
+                for a in range(used):
+                    work[a, i] -= work[share, a] * entry
+            slots[used] = pending
+            work[force, used] = pending_force
             used += 1
             pending = -1
             pending_force = 0.0
         else:
             square = 0.0
+            used -= 1
             for i in range(n):
-                work[leaving, i] = work[blocking, i]
-                square += work[blocking, i] * work[blocking, i]
-            for a in range(s):
+                entry = work[blocking, i]
+                square += entry * entry
+                work[leaving, i] = entry
+                work[blocking, i] = work[used, i]
+            slots[blocking] = slots[used]
+            work[force, blocking] = work[force, used]
+            for a in range(used):
                 part = 0.0
                 for i in range(n):
                     part += work[a, i] * work[leaving, i]
                 part /= square
                 for i in range(n):
                     work[a, i] -= part * work[leaving, i]
-            for i in range(n):
-                work[blocking, i] = 0.0
-            slots[blocking] = -1
-            work[force, blocking] = 0.0
-            used -= 1
 
     # The answer afresh from the active rows, with one refinement step.
     if used > 0:
         for i in range(n):
-            motion[i] = 0.0
-        for a in range(s):
-            if slots[a] >= 0:
-                for i in range(n):
-                    motion[i] -= offsets[slots[a]] * work[a, i]
-        for a in range(s):
-            work[change, a] = 0.0
-            if slots[a] >= 0:
-                part = -offsets[slots[a]]
-                for i in range(n):
-                    part -= rows[slots[a], i] * motion[i]
-                work[change, a] = part
-        for a in range(s):
+            entry = 0.0
+            for a in range(used):
+                entry -= offsets[slots[a]] * work[a, i]
+            motion[i] = entry
+        for a in range(used):
+            part = -offsets[slots[a]]
+            for i in range(n):
+                part -= rows[slots[a], i] * motion[i]
+            work[change, a] = part
+        for a in range(used):
             for i in range(n):
                 motion[i] += work[change, a] * work[a, i]
-        for a in range(s):
-            if slots[a] >= 0:
-                part = 0.0
-                for i in range(n):
-                    part += work[a, i] * motion[i]
-                multipliers[slots[a]] = max(part, 0.0)
+        for a in range(used):
+            part = 0.0
+            for i in range(n):
+                part += work[a, i] * motion[i]
+            multipliers[slots[a]] = max(part, 0.0)
+    for a in range(used, s):
+        slots[a] = -1
     return status, steps
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_whitened_3(rows, offsets, magnitudes, m, motion, multipliers, slots, work):
     """Solve one whitened problem of 3 variables; arrays as in the file's opening."""
     return _solve_rows(
@@ -268,7 +261,7 @@ def solve_whitened_3(rows, offsets, magnitudes, m, motion, multipliers, slots, w
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_whitened(rows, offsets, magnitudes, m, n, limit, motion, multipliers, slots, work):
     """Solve one whitened problem of n variables with room for min(n, m) slots.
 
@@ -280,7 +273,7 @@ def solve_whitened(rows, offsets, magnitudes, m, n, limit, motion, multipliers, 
     )
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _solve_batch(
     hessian, asymmetry, target, rows, offsets, compliance, limit, n, k, s, yields, answer
 ):
@@ -291,10 +284,11 @@ def _solve_batch(
     motion, multipliers, active, residual, status, iterations = answer
     count, m = offsets.shape
     factor = np.zeros((n, n))
+    inverse = np.empty(n)
     unit = np.zeros((m, k))
     gap = np.empty(m)
     magnitudes = np.empty(m)
-    lengths = np.empty(m)
+    shrinks = np.empty(m)
     whitened = np.empty(k)
     forces = np.empty(m)
     slots = np.empty(s, np.int64)
@@ -302,7 +296,7 @@ def _solve_batch(
     definite = False
     for element in range(count):
         if element == 0 or hessian.shape[0] > 1:
-            definite = _factorise(hessian[element], n, asymmetry, factor)
+            definite = _factorise(hessian[element], n, asymmetry, factor, inverse)
         valid = definite
         for i in range(n):
             valid = valid and np.isfinite(target[element, i])
@@ -317,7 +311,7 @@ def _solve_batch(
                 entry = rows[element, row, i]
                 for j in range(i):
                     entry -= factor[i, j] * unit[row, j]
-                entry /= factor[i, i]
+                entry *= inverse[i]
                 unit[row, i] = entry
                 square += entry * entry
             if yields:
@@ -326,15 +320,14 @@ def _solve_batch(
                 unit[row, n + row] = np.sqrt(max(spring, 0.0))
                 square += spring
             valid = valid and np.isfinite(square) and np.isfinite(magnitude)
-            length = np.sqrt(square) if square > 0.0 else 1.0
-            inverse = 1.0 / length
+            shrink = 1.0 / np.sqrt(square) if square > 0.0 else 1.0
             for i in range(n):
-                unit[row, i] *= inverse
+                unit[row, i] *= shrink
             if yields:
-                unit[row, n + row] *= inverse
-            gap[row] = shift * inverse
-            magnitudes[row] = magnitude * inverse
-            lengths[row] = length
+                unit[row, n + row] *= shrink
+            gap[row] = shift * shrink
+            magnitudes[row] = magnitude * shrink
+            shrinks[row] = shrink
         code, steps = _INVALID, 0
         if valid:
             code, steps = _solve_rows(
@@ -342,12 +335,11 @@ def _solve_batch(
             )
         iterations[element] = steps
         status[element] = code
-        if code == _INVALID or code == _INFEASIBLE:
+        if code in (_INVALID, _INFEASIBLE):
             for i in range(n):
                 motion[element, i] = np.nan
             for row in range(m):
                 multipliers[element, row] = np.nan
-                active[element, row] = False
             residual[element] = np.nan
             continue
         worst = 0.0
@@ -355,30 +347,36 @@ def _solve_batch(
             slack = gap[row]
             for i in range(k):
                 slack += unit[row, i] * whitened[i]
-            worst = max(worst, -slack, abs(slack * forces[row]))
-            multipliers[element, row] = forces[row] / lengths[row]
-            active[element, row] = False
+            worst = max(worst, -slack)
+        for a in range(s):
+            row = slots[a]
+            if row < 0:
+                break
+            active[element, row] = True
+            multipliers[element, row] = forces[row] * shrinks[row]
+            slack = gap[row]
+            for i in range(k):
+                slack += unit[row, i] * whitened[i]
+            worst = max(worst, abs(slack * forces[row]))
         for i in range(k):
             defect = whitened[i]
             for a in range(s):
-                if slots[a] >= 0:
-                    defect -= forces[slots[a]] * unit[slots[a], i]
+                if slots[a] < 0:
+                    break
+                defect -= forces[slots[a]] * unit[slots[a], i]
             worst = max(worst, abs(defect))
-        for a in range(s):
-            if slots[a] >= 0:
-                active[element, slots[a]] = True
         residual[element] = worst
         for i in range(n - 1, -1, -1):
             entry = whitened[i]
             for j in range(i + 1, n):
                 entry -= factor[j, i] * whitened[j]
-            whitened[i] = entry / factor[i, i]
+            whitened[i] = entry * inverse[i]
             motion[element, i] = target[element, i] + whitened[i]
 
 
-@njit(inline="always")
-def _factorise(hessian, n, asymmetry, factor):
-    """Lower Cholesky factor of the symmetric part; whether the hessian has one."""
+@njit(inline="always", error_model="numpy")
+def _factorise(hessian, n, asymmetry, factor, inverse):
+    """Lower Cholesky factor of the symmetric part and 1 / its diagonal; whether it exists."""
     definite = True
     for i in range(n):
         for j in range(i + 1):
@@ -390,21 +388,22 @@ def _factorise(hessian, n, asymmetry, factor):
             for k in range(j):
                 entry -= factor[i, k] * factor[j, k]
             if j < i:
-                factor[i, j] = entry / factor[j, j]
+                factor[i, j] = entry * inverse[j]
             elif entry > PIVOT_TOLERANCE * abs(hessian[i, i]) and np.isfinite(entry):
                 factor[i, i] = np.sqrt(entry)
             else:
                 definite = False
                 factor[i, i] = 1.0
+        inverse[i] = 1.0 / factor[i, i]
     return definite
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve_batch_3(hessian, asymmetry, target, rows, offsets, limit, answer):
     _solve_batch(hessian, asymmetry, target, rows, offsets, offsets, limit, 3, 3, 3, False, answer)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve_batch_n(hessian, asymmetry, target, rows, offsets, compliance, limit, answer):
     n, m = target.shape[1], offsets.shape[1]
     yields = compliance.size > 0
@@ -425,7 +424,7 @@ def _solve_batch_n(hessian, asymmetry, target, rows, offsets, compliance, limit,
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normalise_rows(rows, offsets, magnitudes, lengths, m):
     """Divide m whitened rows, offsets and magnitudes by the rows' lengths, in place."""
     n = rows.shape[1]
@@ -443,7 +442,7 @@ def normalise_rows(rows, offsets, magnitudes, lengths, m):
             rows[row, i] /= length
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_elastic_3(rows, offsets, magnitudes, m, motion, multipliers, slots):
     """Answer one infeasible whitened problem by the elastic fallback of elastic.py.
 

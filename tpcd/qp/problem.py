@@ -169,7 +169,7 @@ def check_problem(problem: ContactQP) -> None:
         raise TypeError(f"row_mask is {problem.row_mask.dtype}, expected bool (True = a real row)")
 
 
-def select(problem: ContactQP, chosen: Bool[Tensor, "b"]) -> ContactQP:
+def select(problem: ContactQP, chosen: Bool[Tensor, " b"]) -> ContactQP:
     """The chosen elements of a batch, as a problem with one flat batch axis."""
     n, m, batch = problem.variables, problem.row_count, problem.batch_shape
 

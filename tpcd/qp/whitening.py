@@ -42,7 +42,7 @@ class WhitenedQP:
     factor: tuple[tuple[Float[Tensor, "#b"], ...], ...]
     """Lower triangle of L, row by row."""
     target: Float[Tensor, "n b"]
-    valid: Bool[Tensor, "b"]
+    valid: Bool[Tensor, " b"]
     """False where the element was not a problem; it then holds a harmless one."""
 
     @property

@@ -1,0 +1,109 @@
+"""The movement of the object in the world, with what is believed of floor and wall.
+
+Outlines from first (light) to last step (dark), the path of the end effector, and floor
+and wall as lines with their 90 % bands.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+
+from tpcd.figures.style import FLOOR, TRUTH, WALL, Array, legend_below, panels
+
+MOST_OUTLINES = 12
+"""More outlines than this in one picture hide each other."""
+
+
+def scene(
+    poses: Float[Array, "n 3"],
+    points_ee: Float[Array, "p 2"],
+    floor: tuple[float, float, float],
+    wall: tuple[float, float, float],
+    *,
+    true_floor: float | None = None,
+    true_wall: float | None = None,
+    commands: Float[Array, "n 3"] | None = None,
+) -> Figure:
+    """Draw n poses [m, m, rad] of an outline given in the end-effector frame [m].
+
+    `floor` and `wall` are (mean, low, high) of the floor's z and the wall's x [m] in the
+    world; `true_floor` and `true_wall` add dashed lines, `commands` the commanded path.
+    """
+    poses, points = np.asarray(poses, dtype=float), 1e3 * np.asarray(points_ee, dtype=float)
+    figure, (panel,) = panels(1, 1, 6.4, 4.8)
+    panel.grid(False)
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_OUTLINES)).astype(int))
+    colours = colormaps["Blues"](np.linspace(0.25, 0.95, len(chosen)))
+    outlines = [_placed(points, poses[k]) for k in chosen]
+    for outline, colour in zip(outlines, colours, strict=True):
+        panel.add_patch(Polygon(outline, closed=True, fill=False, edgecolor=colour, linewidth=1.1))
+    path = 1e3 * poses[:, :2]
+    panel.plot(*path.T, color="0.25", linewidth=1.0, marker="o", markersize=2.5)
+    entries: dict[str, Artist | tuple[Artist, ...]] = {
+        f"object at step {chosen[0]}": Line2D([], [], color=colours[0]),
+        f"object at step {chosen[-1]}": Line2D([], [], color=colours[-1]),
+        "end effector": Line2D([], [], color="0.25", marker="o", markersize=3),
+    }
+    drawn = [np.concatenate(outlines), path]
+    if commands is not None:
+        commanded = 1e3 * np.asarray(commands, dtype=float)[:, :2]
+        (entries["command"],) = panel.plot(
+            *commanded.T, color="#D55E00", linewidth=1.3, linestyle=":"
+        )
+        drawn.append(commanded)
+
+    low, high = np.concatenate(drawn).min(axis=0), np.concatenate(drawn).max(axis=0)
+    surfaces = [
+        1e3 * np.array([*belief, belief[0] if truth is None else truth])
+        for belief, truth in ((wall, true_wall), (floor, true_floor))
+    ]
+    # The surfaces belong in the picture unless they are far from everything that happened.
+    reach = float((high - low).max())
+    for axis, surface in enumerate(surfaces):
+        if surface.min() < high[axis] + reach and surface.max() > low[axis] - reach:
+            low[axis], high[axis] = min(low[axis], surface.min()), max(high[axis], surface.max())
+    spare = 0.05 * float((high - low).max())
+    panel.set_xlim(low[0] - spare, high[0] + spare)
+    panel.set_ylim(low[1] - spare, high[1] + spare)
+    entries["floor, mean and 90 %"] = _surface(panel, "h", floor, FLOOR)
+    entries["wall, mean and 90 %"] = _surface(panel, "v", wall, WALL)
+    dashed = {"color": TRUTH, "linewidth": 1.2, "linestyle": "--"}
+    if true_floor is not None:
+        entries["true surface"] = panel.axhline(1e3 * true_floor, **dashed)
+    if true_wall is not None:
+        entries["true surface"] = panel.axvline(1e3 * true_wall, **dashed)
+    panel.set_aspect("equal")
+    panel.set_xlabel("x in the world [mm]")
+    panel.set_ylabel("z in the world [mm]")
+    # Legend keys of drawn vertical lines are vertical; this one stands for both surfaces.
+    if "true surface" in entries:
+        entries["true surface"] = Line2D([], [], **dashed)
+    legend_below(figure, entries)
+    return figure
+
+
+def _surface(
+    panel: Axes, direction: str, belief: tuple[float, float, float], colour: str
+) -> tuple[Artist, ...]:
+    """Draw mean and band of a horizontal ("h") or vertical surface; returns its legend key."""
+    line, span = (
+        (panel.axhline, panel.axhspan) if direction == "h" else (panel.axvline, panel.axvspan)
+    )
+    mean, low, high = (1e3 * value for value in belief)
+    span(low, high, color=colour, alpha=0.3, linewidth=0)
+    line(mean, color=colour, linewidth=1.6)
+    return Patch(color=colour, alpha=0.3, linewidth=0), Line2D([], [], color=colour, linewidth=1.6)
+
+
+def _placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Points of the end-effector frame [mm] at a pose [m, m, rad], in the world [mm]."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    return points @ rotation.T + 1e3 * pose[:2]

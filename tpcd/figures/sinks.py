@@ -1,0 +1,51 @@
+"""Where figures go: PNG files in a result folder, images in a TensorBoard run."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+
+@runtime_checkable
+class ImageWriter(Protocol):
+    """The part of TensorBoard's `SummaryWriter` that figures need."""
+
+    def add_image(
+        self, tag: str, img_tensor: Any, global_step: Any = None, *, dataformats: str = "CHW"
+    ) -> Any:
+        """Store one image under a tag."""
+        ...
+
+
+def save_figure(
+    figure: Figure,
+    folder: str | Path,
+    name: str,
+    writer: ImageWriter | None = None,
+    step: int = 0,
+) -> Path:
+    """Write `folder/name.png`, and the same image to TensorBoard where a writer is given.
+
+    `name` is a file name without its ending. The file appears complete or not at all.
+    """
+    if not name or Path(name).name != name:
+        raise ValueError(f"name of a figure is {name!r}, expected a file name without a folder")
+    path = Path(folder) / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        figure.savefig(temporary, format="png", dpi="figure", facecolor="white")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    if writer is not None:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        image = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        writer.add_image(name, image, step, dataformats="HWC")
+    return path

@@ -1,7 +1,7 @@
 """The native engine: the exact engine's method, one element after the other, by numba.
 
 Whitening, the dual active-set loop (compiled.py), residual and units in one compiled pass
-over the batch; padded rows are skipped. The scalar solvers are passed on from compiled.py. A single thread that releases the interpreter
+over the batch; padded rows are skipped. A single thread that releases the interpreter
 lock. Import this module only where numba is installed.
 """
 
@@ -13,10 +13,7 @@ from numba import njit
 from torch import Tensor
 
 from tpcd.errors import SolverError
-from tpcd.qp.compiled import normalise_rows as normalise_rows
-from tpcd.qp.compiled import solve_elastic_3 as solve_elastic_3
 from tpcd.qp.compiled import solve_rows
-from tpcd.qp.compiled import solve_whitened_3 as solve_whitened_3
 from tpcd.qp.problem import ContactQP, QPSolution, Status
 from tpcd.qp.whitening import PIVOT_TOLERANCE, shared_hessian
 

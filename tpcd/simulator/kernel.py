@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from tpcd.qp.native import normalise_rows, solve_whitened_3
+from tpcd.qp.compiled import normalise_rows, solve_whitened_3
 from tpcd.qp.problem import Status
 
 LIST = 6
@@ -25,6 +25,7 @@ NEWTON_ROUNDS = 6
 """Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
 _PROBE = 0.02
 _FREE_GAP = 1e-5
+_NEAR = 1e-4
 _SEARCH = 12
 _SOLVED = int(Status.SOLVED)
 CONVERGED, NOT_CONVERGED, RELAXED, INVALID = 0, 1, 2, 3
@@ -116,13 +117,14 @@ def _add_candidate(listed, counts, t, point):
 
 
 @njit(cache=True)
-def _scan(points, normals, angle, listed, counts, scratch):
-    """List the lowest point of every terrain at an orientation."""
-    cosine, sine = math.cos(angle), math.sin(angle)
+def _scan(points, normals, offsets, pose, turn, reach, listed, counts, scratch):
+    """List the lowest point of every terrain within reach, the object turned by `turn`."""
+    cosine, sine = math.cos(pose[2] + turn), math.sin(pose[2] + turn)
     for t in range(normals.shape[0]):
         nx, nz = normals[t, 0], normals[t, 1]
         low = _heights(points, cosine * nx + sine * nz, cosine * nz - sine * nx, scratch)
-        _add_candidate(listed, counts, t, _index_of(scratch, low))
+        if counts[t] > 0 or low + nx * pose[0] + nz * pose[1] - offsets[t] <= reach:
+            _add_candidate(listed, counts, t, _index_of(scratch, low))
 
 
 @njit(cache=True)
@@ -302,14 +304,17 @@ def _settle(
     for a in range(3):
         pose[a] = start[a]
     status, residual = NOT_CONVERGED, np.inf
+    # Convex friction pushes on bodies that it does not touch; Coulomb friction does not, so
+    # there a terrain matters only once something has come to it.
+    reach = _NEAR if coulomb else np.inf
     for j in range(3):
         chosen[j, 0] = -1
         multiplier[j] = 0.0
     for k in range(rounds):
-        _scan(points, normals, pose[2], listed, counts, scratch)
-        if k == 0:
-            _scan(points, normals, pose[2] + _PROBE, listed, counts, scratch)
-            _scan(points, normals, pose[2] - _PROBE, listed, counts, scratch)
+        _scan(points, normals, offsets, pose, 0.0, reach, listed, counts, scratch)
+        if k == 0 and not coulomb:
+            _scan(points, normals, offsets, pose, _PROBE, reach, listed, counts, scratch)
+            _scan(points, normals, offsets, pose, -_PROBE, reach, listed, counts, scratch)
         m = _build_rows(
             points, normals, offsets, friction, start, command, pose, root, coulomb, compliance,
             listed, counts, load, rows, values, sizes, row_point, row_terrain, row_side, frame,

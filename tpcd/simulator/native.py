@@ -1,8 +1,7 @@
 """The quasi-static step in compiled loops: tensors in, tensors out.
 
 Used by itself on the CPU where numba is installed and no gradient is asked. The few
-elements whose contact problem has no rigid solution are answered by the torch path, which
-has the elastic fallback.
+elements that are jammed (status RELAXED) come back unanswered, for the torch path to finish.
 """
 
 from __future__ import annotations
@@ -38,6 +37,8 @@ def step(
     settings: StepSettings,
 ) -> Transition:
     """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
+    import numba
+
     from tpcd.simulator.kernel import step_all
 
     count, terrains = len(owner), len(scene.terrains)
@@ -53,7 +54,8 @@ def step(
     residual = torch.empty(count, dtype=torch.float64)
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
-    threads = torch.get_num_threads()
+    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    numba.set_num_threads(threads)
     step_all(
         points.numpy(),
         _flat(normals, terrains, 2),

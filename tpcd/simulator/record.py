@@ -23,7 +23,7 @@ class StepStatus(IntEnum):
 
     CONVERGED = 0, "converged"
     NOT_CONVERGED = 1, "the iterations did not settle; raise rounds or substeps"
-    RELAXED = 2, "no rigid solution (the object is jammed); answered by the elastic fallback"
+    RELAXED = 2, "jammed: no motion satisfies contact with friction; answered without friction"
     INVALID_INPUT = 3, "the pose, command or scene holds a NaN or an infinity"
 
     sentence: str

@@ -9,8 +9,11 @@ slip being the tangential motion of the point since the start of the substep. Wi
 sigma = 0 this is the convex friction of Anitescu (2006); sigma = |slip|, found as a fixed
 point, is Coulomb friction (De Saxce and Feng 1998). `load` is the normal force on that
 terrain and c its compliance. Each round re-linearises everything at the last solution, so
-the answer holds for the turned outline and not only for its first linearisation. This
-file works on tensors of any device; `native` is the same in compiled loops.
+the answer holds for the turned outline and not only for its first linearisation.
+
+With mu >= 1 an object that starts in penetration between two terrains can be jammed: no
+motion satisfies its rows. It is answered without friction, which is always possible and
+pushes it out the shortest way, and flagged RELAXED. This file works on tensors of any device; `native` is the same in compiled loops.
 """
 
 from __future__ import annotations
@@ -97,24 +100,34 @@ def _settle(
         load[running] = _terrain_load(found, terrains)
         change = _motion(step, extent[running])
         residual[running] = change
-        settled = change <= settings.tolerance
+        settled = (change <= settings.tolerance) & ~relaxed
         if k < NEWTON_ROUNDS:
             polished = newton_pose(
                 part, start[running], command[running], stiffness, after, found, settings
             )
             # A step beyond what this round moved comes from a wrong guess of the contacts.
-            trusted = ~settled & (_motion(polished - after, extent[running]) <= 2 * change)
+            small = _motion(polished - after, extent[running]) <= 2 * change
+            trusted = ~settled & ~relaxed & small
             after = torch.where(trusted[:, None], polished, after)
         pose[running] = after
-        # An element that was relaxed stays flagged only if its last round was.
         status[running] = torch.where(
             relaxed,
             int(StepStatus.RELAXED),
             torch.where(settled, int(StepStatus.CONVERGED), int(StepStatus.NOT_CONVERGED)),
         )
-        running = running[~settled]
+        running = running[~settled & ~relaxed]
     pose[~finite] = torch.nan
+    jammed = torch.nonzero(status == int(StepStatus.RELAXED)).flatten()
+    if len(jammed) > 0:
+        part = _without_friction(scene.gather(jammed))
+        free = _settle(part, start[jammed], command[jammed], stiffness, settings)
+        pose[jammed], residual[jammed] = free.pose, free.residual
+        _put(contacts, jammed, free.contacts)
     return Settled(pose, contacts, status, residual)
+
+
+def _without_friction(scene: ContactScene) -> ContactScene:
+    return replace(scene, friction=torch.zeros_like(scene.friction))
 
 
 def _candidate_rows(

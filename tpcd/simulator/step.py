@@ -114,7 +114,7 @@ def _relax_jammed(
     stiffness: Tensor,
     settings: StepSettings,
 ) -> None:
-    """Answer the elements the compiled loops found infeasible by the elastic fallback."""
+    """Answer the elements the compiled loops found jammed, without friction."""
     jammed = torch.nonzero(flat.status == int(StepStatus.RELAXED)).flatten()
     if len(jammed) == 0:
         return

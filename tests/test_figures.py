@@ -269,3 +269,10 @@ def test_drawing_does_not_touch_the_global_state_of_pyplot() -> None:
     assert (
         subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[1]).returncode == 0
     )
+
+
+def test_a_missing_error_leaves_a_gap() -> None:
+    rows = [{"object": "mug", "x_mm": 1.0}, {"object": "bowl", "x_mm": None}]
+    (panel,) = figures.error_bars(rows, {"x_mm": "error of x [mm]"}).axes
+    lengths = [patch.get_width() for patch in panel.patches]
+    assert np.isnan(lengths[0]) and lengths[1] == 1.0

@@ -149,7 +149,7 @@ def _parser(
             default = fields[name].default
             details["default"] = list(default) if isinstance(default, tuple) else default
         elif fields[name].default_factory is not dataclasses.MISSING:
-            details["default"] = fields[name].default_factory()
+            details["default"] = typing.cast(Any, fields[name].default_factory)()
         else:
             details["required"] = True
         if types[name] is bool:

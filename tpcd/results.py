@@ -140,8 +140,9 @@ def to_plain(value: Any, *, flagged: list[str] | None = None, place: str = "") -
             str(key): to_plain(entry, flagged=flagged, place=f"{place}{dot}{key}")
             for key, entry in value.items()
         }
-    if hasattr(value, "tolist"):  # arrays, tensors and their scalars
-        value = value.tolist()
+    to_list = getattr(value, "tolist", None)
+    if to_list is not None:  # arrays, tensors and their scalars
+        value = to_list()
     if isinstance(value, (list, tuple, set, frozenset)):
         entries = sorted(value) if isinstance(value, (set, frozenset)) else value
         return [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -13,6 +12,7 @@ from tpcd.figures.style import (
     TEXT,
     TRUTH,
     Array,
+    LegendKey,
     axis_label,
     display_unit,
     legend_below,
@@ -44,7 +44,7 @@ def prediction(
     rows, mean, low, high = (np.asarray(value, dtype=float) for value in (rows, mean, low, high))
     steps = np.arange(first_step, first_step + len(rows))
     figure, axes = panels(2, 3, 3.3, 2.2, share_x=True)
-    entries: dict[str, Artist] = {}
+    entries: dict[str, LegendKey] = {}
     for i, panel in enumerate(axes):
         factor, unit = display_unit(CHANNEL_UNITS[i])
         band = panel.fill_between(

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.artist import Artist
-from matplotlib.container import Container
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import binom
 
-from tpcd.figures.style import SERIES, TRUTH, Array, legend_below, panels, title
+from tpcd.figures.style import SERIES, TRUTH, Array, LegendKey, legend_below, panels, title
 
 
 def calibration(
@@ -96,7 +94,7 @@ def error_bars(
     figure, axes = panels(
         1, len(values), max(2.2, 9.5 / len(values)), 1.0 + 0.24 * len(objects) * max(1, len(groups))
     )
-    entries: dict[str, Artist | Container] = {}
+    entries: dict[str, LegendKey] = {}
     for column, (panel, (key, text)) in enumerate(zip(axes, values.items(), strict=True)):
         for i, name in enumerate(groups):
             chosen = {
@@ -104,7 +102,7 @@ def error_bars(
                 for row in table
                 if not group or str(row[group]) == name
             }
-            lengths = [np.nan if chosen.get(entry) is None else chosen[entry] for entry in objects]
+            lengths = np.array([chosen.get(entry) for entry in objects], dtype=float)
             offset = (i - (len(groups) - 1) / 2) * height
             entries[name] = panel.barh(
                 np.arange(len(objects)) - offset, lengths, 0.9 * height, color=SERIES[i % 6]

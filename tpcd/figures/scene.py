@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
-from tpcd.figures.style import FLOOR, TRUTH, WALL, Array, legend_below, panels
+from tpcd.figures.style import FLOOR, TRUTH, WALL, Array, LegendKey, legend_below, panels
 
 MOST_OUTLINES = 12
 """More outlines than this in one picture hide each other."""
@@ -46,7 +46,7 @@ def scene(
         panel.add_patch(Polygon(outline, closed=True, fill=False, edgecolor=colour, linewidth=1.1))
     path = 1e3 * poses[:, :2]
     panel.plot(*path.T, color="0.25", linewidth=1.0, marker="o", markersize=2.5)
-    entries: dict[str, Artist | tuple[Artist, ...]] = {
+    entries: dict[str, LegendKey] = {
         f"object at step {chosen[0]}": Line2D([], [], color=colours[0]),
         f"object at step {chosen[-1]}": Line2D([], [], color=colours[-1]),
         "end effector": Line2D([], [], color="0.25", marker="o", markersize=3),

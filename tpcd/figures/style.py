@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -19,6 +20,9 @@ from torch import Tensor
 
 Array = np.ndarray | Tensor
 """What figures take: NumPy arrays, or tensors on the CPU without gradients."""
+
+LegendKey = Artist | Container | tuple[Artist, ...]
+"""What a legend can show beside a text."""
 
 BELIEF = "#0072B2"
 TRUTH = "#000000"
@@ -68,12 +72,10 @@ def title(panel: Axes, text: str) -> None:
     panel.set_title(text, fontsize=TEXT, loc="left")
 
 
-def legend_below(
-    figure: Figure, entries: Mapping[str, Artist | Container | tuple[Artist, ...]], columns: int = 4
-) -> None:
+def legend_below(figure: Figure, entries: Mapping[str, LegendKey], columns: int = 4) -> None:
     """One legend for the whole figure, under its panels, where it hides no data."""
     figure.legend(
-        list(entries.values()),
+        cast(Any, list(entries.values())),  # tuples are keys drawn over each other
         list(entries),
         loc="outside lower center",
         ncols=min(len(entries), columns),

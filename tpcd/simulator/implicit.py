@@ -26,11 +26,12 @@ from tpcd.simulator.record import ContactSet, StepSettings
 
 @dataclass(frozen=True)
 class LinearResponse:
-    """First-order change of the settled pose with start, command and the gap of each terrain."""
+    """First-order change of the settled pose with start, command, gap and lever of each terrain."""
 
     start: Float[Tensor, "b 3 3"]
     command: Float[Tensor, "b 3 3"]
     gap: Float[Tensor, "b t 3"]
+    lever: Float[Tensor, "b t 3"]
 
 
 @dataclass(frozen=True)
@@ -82,14 +83,18 @@ def linear_response(
             push = torch.zeros_like(zero_force)
             push[:, axis] = stiffness[axis]
             columns.append(_solve(system, push, torch.zeros_like(system.row_residual)))
-        gap = []
+        gap, lever = [], []
         for t in range(len(scene.terrains)):
             here = ((contacts.terrain == t) & system.loaded).to(pose.dtype)
             gap.append(_solve(system, zero_force, -here))
+            moment = torch.zeros_like(zero_force)
+            moment[:, 2] = (here * contacts.multiplier).sum(-1)
+            lever.append(_solve(system, moment, torch.zeros_like(here)))
         return LinearResponse(
             start=torch.stack(columns[:3], dim=-1),
             command=torch.stack(columns[3:], dim=-1),
             gap=torch.stack(gap, dim=-2),
+            lever=torch.stack(lever, dim=-2),
         )
 
 

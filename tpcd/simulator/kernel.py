@@ -374,8 +374,8 @@ def _settle(
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def step_all(
     points, normals, offsets, friction, owner, starts, commands, stiffness, coulomb, substeps,
-    rounds, tolerance, compliance, chunks, sensitive,
-    poses, modes, statuses, residuals, from_start, from_gap,
+    rounds, tolerance, compliance, chunks,
+    poses, modes, statuses, residuals, from_start, from_gap, from_lever,
 ):
     """Step every transition; `owner` names the scene of each. Outputs are filled in place."""
     count, terrains = starts.shape[0], normals.shape[1]
@@ -394,7 +394,9 @@ def step_all(
         vector, force, row_right = np.empty(3), np.empty(3), np.empty(3)
         landing, land, land_gap = np.empty(3), np.zeros((3, 3)), np.zeros((terrains, 3))
         whole, whole_gap = np.zeros((3, 3)), np.zeros((terrains, 3))
-        by_start, by_command, by_gap = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((terrains, 3))
+        whole_lever, no_lever = np.zeros((terrains, 3)), np.zeros((terrains, 3))
+        by_start, by_command = np.zeros((3, 3)), np.zeros((3, 3))
+        by_gap, by_lever = np.zeros((terrains, 3)), np.zeros((terrains, 3))
         root = np.sqrt(stiffness)
         owned, extent = -1, 0.0
         for b in range(chunk * count // chunks, (chunk + 1) * count // chunks):
@@ -412,7 +414,8 @@ def step_all(
                 finite = finite and math.isfinite(start[a]) and math.isfinite(command[a])
             if not finite:
                 statuses[b], residuals[b] = INVALID, np.inf
-                poses[b], modes[b], from_start[b], from_gap[b] = np.nan, 0, np.nan, np.nan
+                poses[b], modes[b] = np.nan, 0
+                from_start[b], from_gap[b], from_lever[b] = np.nan, np.nan, np.nan
                 continue
             turn = command[2] - start[2]
             command[2] = start[2] + math.pi - (math.pi - turn) % (2.0 * math.pi)
@@ -424,13 +427,13 @@ def step_all(
                 pose[a] = landing[a]
             if fraction == 1.0:
                 poses[b], modes[b], statuses[b], residuals[b] = command, 0, CONVERGED, 0.0
-                from_start[b], from_gap[b] = 0.0, 0.0
+                from_start[b], from_gap[b], from_lever[b] = 0.0, 0.0, 0.0
                 continue
             _landing_response(
                 points[o], normals[o], offsets[o], start, command, fraction, point, terrain,
                 land, land_gap, frame,
             )
-            whole[:], whole_gap[:] = land, land_gap
+            whole[:], whole_gap[:], whole_lever[:] = land, land_gap, 0.0
             status, residual = CONVERGED, 0.0
             for k in range(substeps):
                 share = (k + 1) / substeps
@@ -447,22 +450,23 @@ def step_all(
                 status, residual = max(status, ended), max(residual, left)
                 if status == RELAXED:
                     break
-                if sensitive:
-                    _linear_system(
-                        points[o], normals[o], offsets[o], friction[o], start, part, pose,
-                        stiffness, coulomb, compliance, chosen, multiplier, side, slipping,
-                        system, frame,
-                    )
-                    _responses(
-                        system, chosen, stiffness, terrains, by_start, by_command, by_gap, force,
-                        row_right, vector,
-                    )
-                    _chain(whole, whole_gap, land, land_gap, by_start, by_command, by_gap, share)
+                _linear_system(
+                    points[o], normals[o], offsets[o], friction[o], start, part, pose,
+                    stiffness, coulomb, compliance, chosen, multiplier, side, slipping,
+                    system, frame,
+                )
+                _responses(
+                    system, chosen, stiffness, load, terrains, by_start, by_command, by_gap,
+                    by_lever, force, row_right, vector,
+                )
+                _chain(whole, land, by_start, by_command, share, vector)
+                _chain_rows(whole_gap, land_gap, by_start, by_command, by_gap, share, vector)
+                _chain_rows(whole_lever, no_lever, by_start, by_command, by_lever, share, vector)
             for a in range(3):
                 poses[b, a] = pose[a]
             _modes(chosen, multiplier, side, slipping, modes[b])
             statuses[b], residuals[b] = status, residual
-            from_start[b], from_gap[b] = whole, whole_gap
+            from_start[b], from_gap[b], from_lever[b] = whole, whole_gap, whole_lever
 
 
 @njit(cache=True)
@@ -491,9 +495,10 @@ def _landing_response(
 
 @njit(cache=True)
 def _responses(
-    system, chosen, stiffness, terrains, by_start, by_command, by_gap, force, row, vector
+    system, chosen, stiffness, load, terrains, by_start, by_command, by_gap, by_lever, force, row,
+    vector,
 ):
-    """Derivatives of the settled pose by start, command and the gap of each terrain."""
+    """Derivatives of the settled pose by start, command, and gap and lever of each terrain."""
     for c in range(3):
         for j in range(3):
             force[j], row[j] = 0.0, -system[12 + j, c]
@@ -512,12 +517,16 @@ def _responses(
         _respond(system, chosen, force, row, vector)
         for a in range(3):
             by_gap[t, a] = vector[a]
+            row[a] = 0.0
+        force[2] = load[t]
+        _respond(system, chosen, force, row, vector)
+        for a in range(3):
+            by_lever[t, a] = vector[a]
 
 
 @njit(cache=True)
-def _chain(whole, whole_gap, land, land_gap, by_start, by_command, by_gap, share):
-    """Append one substep to the derivatives of the whole step."""
-    column = np.empty(3)
+def _chain(whole, land, by_start, by_command, share, column):
+    """Append one substep to the derivative of the whole step by the start pose."""
     for c in range(3):
         for a in range(3):
             column[a] = whole[a, c]
@@ -526,15 +535,20 @@ def _chain(whole, whole_gap, land, land_gap, by_start, by_command, by_gap, share
             for k in range(3):
                 value += by_start[a, k] * column[k] + (1.0 - share) * by_command[a, k] * land[k, c]
             whole[a, c] = value
-    for t in range(whole_gap.shape[0]):
+
+
+@njit(cache=True)
+def _chain_rows(whole, land, by_start, by_command, by_input, share, column):
+    """The same for a derivative kept as one row for each terrain."""
+    for t in range(whole.shape[0]):
         for a in range(3):
-            column[a] = whole_gap[t, a]
+            column[a] = whole[t, a]
         for a in range(3):
-            value = by_gap[t, a]
+            value = by_input[t, a]
             for k in range(3):
                 value += by_start[a, k] * column[k]
-                value += (1.0 - share) * by_command[a, k] * land_gap[t, k]
-            whole_gap[t, a] = value
+                value += (1.0 - share) * by_command[a, k] * land[t, k]
+            whole[t, a] = value
 
 
 @njit(cache=True)

@@ -54,6 +54,7 @@ def step(
     residual = torch.empty(count, dtype=torch.float64)
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
+    from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
     threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
     numba.set_num_threads(threads)
     step_all(
@@ -71,19 +72,19 @@ def step(
         settings.tolerance,
         settings.compliance,
         max(1, min(8 * threads, math.ceil(count / CHUNK))),
-        True,
         pose.numpy(),
         mode.numpy(),
         status.numpy(),
         residual.numpy(),
         from_start.numpy(),
         from_gap.numpy(),
+        from_lever.numpy(),
     )
     turn = start[:, 2].double() + wrap_angle(command[:, 2].double() - start[:, 2].double())
     target = torch.cat((command[:, :2].double(), turn[:, None]), dim=-1)
     wrench = stiffness.double() * (pose - target)
     pose[:, 2] = wrap_angle(pose[:, 2])
-    return Transition(pose, wrench, mode, status, residual, from_start, from_gap)
+    return Transition(pose, wrench, mode, status, residual, from_start, from_gap, from_lever)
 
 
 def _flat(tensor: Tensor, *shape: int):

@@ -96,10 +96,7 @@ class Transition:
 
     `pose` (x, z, angle) [m, m, rad]; `wrench` (F_x, F_z, torque) [N, N, N·m] that the world
     exerts on the object about the end-effector origin; `mode` the `ContactMode` against each
-    terrain; `residual` the largest remaining motion or penetration of the last round [m].
-    `pose_from_start` is the derivative of the settled pose with respect to the start pose,
-    `pose_from_gap` with respect to the gap of each terrain (row t: how the pose moves when
-    everything that touches terrain t lies further out by one metre, negative outwards).
+    terrain; `residual` the largest remaining motion of the last round [m].
     """
 
     pose: Float[Tensor, "*batch 3"]
@@ -108,4 +105,10 @@ class Transition:
     status: Int[Tensor, "*batch"]
     residual: Float[Tensor, "*batch"]
     pose_from_start: Float[Tensor, "*batch 3 3"]
+    """Derivative of the settled pose with respect to the start pose."""
     pose_from_gap: Float[Tensor, "*batch t 3"]
+    """Derivative of the settled pose with respect to the gap to terrain t: what a wrong outline
+    or a wrong terrain height does."""
+    pose_from_lever: Float[Tensor, "*batch t 3"]
+    """Derivative of the settled pose with respect to the lever of terrain t, the tangential
+    offset of the contact point from the end effector [m]: what a shifted contact point does."""

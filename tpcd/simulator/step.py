@@ -60,6 +60,7 @@ def simulate_step(
         residual=flat.residual.reshape(batch),
         pose_from_start=flat.pose_from_start.reshape(*batch, 3, 3),
         pose_from_gap=flat.pose_from_gap.reshape(*batch, -1, 3),
+        pose_from_lever=flat.pose_from_lever.reshape(*batch, -1, 3),
     )
 
 
@@ -134,6 +135,7 @@ def _step(
     flight = first_touch(scene, start, command)
     landing, landing_from_start, landing_from_gap = _fly(scene, start, command, flight)
     pose, from_start, from_gap = landing, landing_from_start, landing_from_gap
+    from_lever = torch.zeros_like(from_gap)
     status = torch.full_like(flight.point, int(StepStatus.CONVERGED))
     residual = torch.zeros_like(flight.fraction)
     settled = None
@@ -151,6 +153,7 @@ def _step(
             + from_gap @ response.start.mT
             + (1 - share) * landing_from_gap @ response.command.mT
         )
+        from_lever = response.lever + from_lever @ response.start.mT
         pose = newton_pose(*arguments)
         status = torch.maximum(status, settled.status)
         residual = torch.maximum(residual, settled.residual)
@@ -163,6 +166,7 @@ def _step(
         residual=residual,
         pose_from_start=from_start,
         pose_from_gap=from_gap,
+        pose_from_lever=from_lever,
     )
 
 

@@ -18,10 +18,11 @@ lowest index, so an element's bits do not depend on its neighbours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.qp.problem import Status
@@ -33,8 +34,8 @@ DEPENDENCE_TOLERANCE = 1e-10
 """A unit row whose rest outside the active span is shorter than this depends on them."""
 RATIO_TOLERANCE = 1e-11
 """A multiplier that shrinks more slowly than this does not block; it is rounding."""
-COMPACTION = 0.75
-"""Finished elements are set aside when at most this fraction is left."""
+COMPACTION = 0.7
+"""Finished elements are dropped from the working arrays when at most this fraction is left."""
 
 
 @dataclass(frozen=True)
@@ -45,30 +46,29 @@ class ActiveSet:
     """w."""
     multipliers: Float[Tensor, "m b"]
     """Of the unit rows; zero on inactive rows."""
-    slots: Int[Tensor, "s b"]
-    """Indices of the active rows, -1 in free slots."""
+    active: Bool[Tensor, "m b"]
     status: Int[Tensor, " b"]
     iterations: Int[Tensor, " b"]
 
 
-@dataclass
-class _State:
-    """What one element carries from step to step; the batch is the last axis of each."""
+class _State(NamedTuple):
+    """What the elements carry from step to step; the batch is the last axis of each."""
 
-    offsets: Tensor
-    """Offsets plus tolerance; +inf on active rows, so that they are not chosen again."""
     rows: Tensor
+    """Unit rows and, as entry k, their offsets plus tolerance (`k+1 m b`)."""
     motion: Tensor
+    """w and, as entry k, 1 (`k+1 b`)."""
     basis: Tensor
-    """D, by slot; zero in free slots."""
+    """The dual basis D by slot (`s k b`), zero in free slots."""
     active_rows: Tensor
-    """N, by slot; zero in free slots."""
-    multipliers: Tensor
-    """By slot."""
+    """The active rows N by slot (`s k b`), zero in free slots."""
+    forces: Tensor
+    """Multipliers by slot (`s b`)."""
     slots: Tensor
+    """Active row of each slot (`s b`), m where free."""
     pending: Tensor
-    """The row being added, -1 if none: it stays while blocking rows are dropped."""
-    pending_multiplier: Tensor
+    """The row being added, m if none: it stays while blocking rows are dropped."""
+    pending_force: Tensor
     element: Tensor
 
 
@@ -81,40 +81,41 @@ def solve_exact(problem: WhitenedQP, iteration_limit: int | None = None) -> Acti
     k, m, count = problem.rows.shape
     limit = 10 * (m + k) if iteration_limit is None else iteration_limit
     state = _start(problem)
-    motion = torch.zeros_like(problem.rows[:, 0] if m else problem.rows.new_zeros(k, count))
-    slots = torch.full_like(state.slots, -1)
-    multipliers = torch.zeros_like(problem.offsets)
     status = state.element.new_full((count,), int(Status.ITERATION_LIMIT))
     iterations = torch.full_like(status, limit)
+    basis, slots = state.basis.clone(), state.slots.clone()
     if m == 0 or count == 0:
-        return ActiveSet(motion, multipliers, slots, torch.zeros_like(status), status * 0)
+        status, iterations = torch.zeros_like(status), torch.zeros_like(status)
+        return _answer(problem, basis, slots, status, iterations)
 
     finished = torch.zeros_like(state.element, dtype=torch.bool)
     for step in range(limit + 1):
-        excess = _dot(state.rows, state.motion) + state.offsets
-        excess += VIOLATION_TOLERANCE * _norm(state.motion)
-        worst, chosen = _minimum(excess)
-        done = ~finished & (worst >= 0) & (state.pending < 0)
-        chosen = torch.where(state.pending >= 0, state.pending, chosen)
-        status[state.element[done]] = int(Status.SOLVED)
-        iterations[state.element[done]] = step
+        worst, chosen = _most_violated(state)
+        idle = state.pending == m
+        chosen = torch.where(idle, chosen, state.pending)
+        done = (worst >= 0) & idle & ~finished
+        over = done | ~finished if step == limit else done
+        at = over.nonzero()[:, 0]
+        where = state.element[at]
+        slots[:, where] = state.slots[:, at]
+        basis[..., where] = state.basis[..., at]
+        settled = state.element[done.nonzero()[:, 0]] if step == limit else where
+        status[settled] = int(Status.SOLVED)
+        iterations[settled] = step
         finished |= done
-        remaining = int((~finished).sum())
-        if remaining == 0 or step == limit or remaining <= COMPACTION * finished.numel():
-            over = finished if step < limit and remaining else torch.ones_like(finished)
-            _record(problem, state, over, motion, multipliers, slots)
-            if remaining == 0 or step == limit:
-                break
-            keep = (~finished).nonzero()[:, 0]
-            for field in fields(state):
-                value = getattr(state, field.name)
-                setattr(state, field.name, value.index_select(value.ndim - 1, keep))
+        keep = (~finished).nonzero()[:, 0]
+        if keep.numel() == 0 or step == limit:
+            break
+        if keep.numel() <= COMPACTION * finished.numel():
+            state = _State(*(part.index_select(part.ndim - 1, keep) for part in state))
             chosen, finished = chosen[keep], finished[keep]
-        infeasible = _advance(problem, state, chosen, ~finished)
-        status[state.element[infeasible]] = int(Status.INFEASIBLE)
-        iterations[state.element[infeasible]] = step + 1
-        finished |= infeasible
-    return ActiveSet(motion, multipliers, slots, status, iterations)
+        state, contradicted = _advance(state, chosen)
+        contradicted &= ~finished
+        where = state.element[contradicted]
+        status[where] = int(Status.INFEASIBLE)
+        iterations[where] = step + 1
+        finished |= contradicted
+    return _answer(problem, basis, slots, status, iterations)
 
 
 def optimality_residual(problem: WhitenedQP, answer: ActiveSet) -> Float[Tensor, " b"]:
@@ -123,16 +124,14 @@ def optimality_residual(problem: WhitenedQP, answer: ActiveSet) -> Float[Tensor,
     Stationarity |w - rows^T u|, rows max(0, -slack), signs max(0, -u), complementarity
     |u slack|; all but the last in the unit of w [sqrt(J)], the last in its square.
     """
-    worst = torch.zeros_like(problem.target[0])
-    for i, entry in enumerate(answer.motion):
-        if problem.rows.shape[1]:
-            entry = entry - _dot(problem.rows[i], answer.multipliers)
-        worst = torch.maximum(worst, entry.abs())
-    for j, multiplier in enumerate(answer.multipliers):
-        slack = _dot(problem.rows[:, j], answer.motion) + problem.offsets[j]
-        for violation in (-slack, -multiplier, (slack * multiplier).abs()):
-            worst = torch.maximum(worst, violation)
-    return worst
+    force = answer.multipliers
+    if problem.rows.shape[1] == 0:
+        return torch.zeros_like(problem.target[0])
+    slack = _sum(problem.rows * answer.motion[:, None]) + problem.offsets
+    pushed = _sum((problem.rows * force).transpose(0, 1))
+    parts = (-slack, -force, (slack * force).abs(), (answer.motion - pushed).abs())
+    worst = torch.stack([part.amax(0) for part in parts]).amax(0)
+    return worst.clamp_min(0.0)
 
 
 def _start(problem: WhitenedQP) -> _State:
@@ -140,143 +139,132 @@ def _start(problem: WhitenedQP) -> _State:
     s = min(k, m)
     zeros = problem.offsets.new_zeros
     element = torch.arange(count, device=problem.rows.device)
+    tolerated = problem.offsets + VIOLATION_TOLERANCE * problem.magnitudes
+    motion = zeros(k + 1, count)
+    motion[k] = 1.0
     return _State(
-        offsets=problem.offsets + VIOLATION_TOLERANCE * problem.magnitudes,
-        rows=problem.rows,
-        motion=zeros(k, count),
+        rows=torch.cat((problem.rows, tolerated[None])),
+        motion=motion,
         basis=zeros(s, k, count),
         active_rows=zeros(s, k, count),
-        multipliers=zeros(s, count),
-        slots=element.new_full((s, count), -1),
-        pending=torch.full_like(element, -1),
-        pending_multiplier=zeros(count),
+        forces=zeros(s, count),
+        slots=element.new_full((s, count), m),
+        pending=torch.full_like(element, m),
+        pending_force=zeros(count),
         element=element,
     )
 
 
-def _advance(problem: WhitenedQP, state: _State, chosen: Tensor, live: Tensor) -> Tensor:
-    """One step of every live element towards its chosen row; returns the infeasible ones."""
-    k, s = state.motion.shape[0], state.slots.shape[0]
-    row = state.rows.gather(1, chosen.expand(k, 1, -1))[:, 0]
-    offset = problem.offsets[chosen, state.element]
-    violation = _dot(row, state.motion) + offset
+def _most_violated(state: _State) -> tuple[Tensor, Tensor]:
+    """Value and index of the most violated inactive row, the first of equals."""
+    m, count = state.rows.shape[1:]
+    rounding = VIOLATION_TOLERANCE * _sum(state.motion[:-1].abs())
+    excess = state.motion.new_empty(m + 1, count)
+    torch.add(_dot(state.rows, state.motion), rounding, out=excess[:m])
+    excess[m] = torch.inf
+    excess.scatter_(0, state.slots, torch.inf)
+    worst, chosen = excess.min(0)
+    return worst, chosen
 
-    share = _dot_basis(state.basis, row)
-    rest = _subtract_combination(row, share, state.active_rows)
+
+def _advance(state: _State, chosen: Tensor) -> tuple[_State, Tensor]:
+    """One step of every element towards its chosen row, and which ones are infeasible.
+
+    Elements that are finished step on as well; their answers are already recorded.
+    """
+    (s, k, count), m = state.basis.shape, state.rows.shape[1]
+    basis, active_rows = state.basis, state.active_rows
+    extended = state.rows.gather(1, chosen.expand(k + 1, 1, count))[:, 0]
+    violation = _sum(extended * state.motion)
+    row = extended[:k]
+    share = _dot_slots(basis, row)
+    rest = row - _sum(share[:, None] * active_rows)
     # Once more: the rest is now orthogonal to the active rows up to rounding.
-    correction = _dot_basis(state.basis, rest)
-    share += correction
-    rest = _subtract_combination(rest, correction, state.active_rows)
-    square = _dot(rest, rest)
+    correction = _dot_slots(basis, rest)
+    share = share + correction
+    rest = rest - _sum(correction[:, None] * active_rows)
+    square = _sum(rest * rest)
     size = 1.0 + _sum(share.abs())
     independent = square > (DEPENDENCE_TOLERANCE * size) ** 2
+    highest, free = state.slots.max(0)
     if s == k:
-        independent &= (state.slots < 0).any(0)
+        independent &= highest == m
 
     full_step = torch.where(independent, (-violation).clamp_min(0.0) / square, torch.inf)
-    ratio = torch.where(share > RATIO_TOLERANCE, state.multipliers / share, torch.inf)
-    partial_step, blocking = _minimum(ratio)
+    ratio = torch.where(share > RATIO_TOLERANCE, state.forces / share, torch.inf)
+    partial_step, blocking = ratio.min(0)
     length = torch.minimum(full_step, partial_step)
-    infeasible = live & length.isinf()
-    moving = live & ~infeasible
-    adding = moving & independent & (full_step <= partial_step)
-    length = torch.where(moving, length, 0.0)
-    state.motion = state.motion + torch.where(independent, length, 0.0) * rest
-    state.multipliers = state.multipliers - length * share
-    state.pending_multiplier = state.pending_multiplier + length
+    adding = independent & (full_step <= partial_step)
+    motion = state.motion.clone()
+    motion[:k] += torch.where(independent, length, 0.0) * rest
+    forces = state.forces - length * share
+    pending_force = state.pending_force + length
 
-    slot = torch.where(adding, (state.slots < 0).to(torch.uint8).argmax(0), blocking)
-    leaving = state.basis.gather(0, slot.expand(1, k, -1))[0]
+    slot = torch.where(adding, free, blocking)[None]
+    place = slot.expand(k, count)[None]
+    leaving = basis.gather(0, place)[0]
+    overlap = _dot_slots(basis, leaving)
+    overlap = overlap / overlap.gather(0, slot)
     direction = torch.where(adding, rest / square, leaving)
-    overlap = _dot_basis(state.basis, leaving) / _dot(leaving, leaving)
-    coefficient = torch.where(moving, torch.where(adding, share, overlap), 0.0)
-    left = state.slots.gather(0, slot[None])[0]
-    changed = torch.where(adding, chosen, torch.where(moving, left, chosen))[None]
-    tolerated = (
-        problem.offsets[changed[0], state.element]
-        + VIOLATION_TOLERANCE * problem.magnitudes[changed[0], state.element]
+    basis = basis - torch.where(adding, share, overlap)[:, None] * direction
+    basis.scatter_(0, place, torch.where(adding, direction, 0.0)[None])
+    state = _State(
+        rows=state.rows,
+        motion=motion,
+        basis=basis,
+        active_rows=active_rows.scatter(0, place, torch.where(adding, row, 0.0)[None]),
+        forces=forces.scatter_(0, slot, torch.where(adding, pending_force, 0.0)[None]),
+        slots=state.slots.scatter(0, slot, torch.where(adding, chosen, m)[None]),
+        pending=torch.where(adding, m, chosen),
+        pending_force=torch.where(adding, 0.0, pending_force),
+        element=state.element,
     )
-    state.offsets.scatter_(0, changed, torch.where(adding, torch.inf, tolerated)[None])
-
-    hot = (torch.arange(s, device=slot.device)[:, None] == slot) & moving
-    state.basis = torch.where(
-        hot[:, None],
-        torch.where(adding, direction, 0.0),
-        state.basis - coefficient[:, None] * direction,
-    )
-    state.active_rows = torch.where(hot[:, None], torch.where(adding, row, 0.0), state.active_rows)
-    added = torch.where(adding, state.pending_multiplier, 0.0)
-    state.multipliers = torch.where(hot, added, state.multipliers)
-    state.slots = torch.where(hot, torch.where(adding, chosen, -1), state.slots)
-    state.pending_multiplier = torch.where(adding, 0.0, state.pending_multiplier)
-    state.pending = torch.where(moving & ~adding, chosen, -1)
-    return infeasible
+    return state, length.isinf()
 
 
-def _record(
-    problem: WhitenedQP,
-    state: _State,
-    over: Tensor,
-    motion: Tensor,
-    multipliers: Tensor,
-    slots: Tensor,
-) -> None:
-    """Write the answers of finished elements, solved afresh from their active rows."""
-    pick = over.nonzero()[:, 0]
-    element, chosen = state.element[pick], state.slots[:, pick]
-    basis, active_rows = state.basis[..., pick], state.active_rows[..., pick]
-    used = chosen >= 0
-    safe = chosen.clamp_min(0)
-    wanted = -torch.where(used, problem.offsets[safe, element], 0.0)
-    answer = _sum(wanted[:, None] * basis)
-    # One refinement step removes what the updates of the basis have accumulated.
-    defect = wanted - _dot_basis(active_rows, answer)
-    answer = answer + _sum(defect[:, None] * basis)
-    forces = _dot_basis(basis, answer).clamp_min(0.0)
-    motion[:, element] = answer
-    slots[:, element] = chosen
-    for i in range(chosen.shape[0]):
-        held = used[i]
-        multipliers[chosen[i][held], element[held]] = forces[i][held]
+def _answer(
+    problem: WhitenedQP, basis: Tensor, slots: Tensor, status: Tensor, iterations: Tensor
+) -> ActiveSet:
+    """Motion and multipliers afresh from the active rows, with one refinement step."""
+    k, m, count = problem.rows.shape
+    padding = problem.rows.new_zeros(k, 1, count)
+    rows = torch.cat((problem.rows, padding), dim=1)
+    offsets = torch.cat((problem.offsets, padding[0]))
+    held = rows.gather(1, slots.expand(k, *slots.shape)).transpose(0, 1)
+    wanted = -offsets.gather(0, slots)
+    motion = problem.rows.new_zeros(k, count)
+    forces = torch.zeros_like(wanted)
+    if len(slots):
+        motion = _sum(wanted[:, None] * basis)
+        defect = wanted - _dot_slots(held, motion)
+        motion = motion + _sum(defect[:, None] * basis)
+        forces = _dot_slots(basis, motion).clamp_min(0.0)
+    multipliers = torch.zeros_like(offsets).scatter_(0, slots, forces)
+    active = torch.zeros_like(offsets, dtype=torch.bool).scatter_(0, slots, True)
+    return ActiveSet(motion, multipliers[:m], active[:m], status, iterations)
 
 
 def _sum(values: Tensor) -> Tensor:
-    """Sum over the first axis, term by term."""
-    total = values[0]
-    for i in range(1, values.shape[0]):
-        total = total + values[i]
+    """Sum over the first axis, term by term: the order is the same for every batch."""
+    first, *others = values.unbind(0)
+    if not others:
+        return first
+    total = first + others[0]
+    for term in others[1:]:
+        total += term
     return total
 
 
 def _dot(left: Tensor, right: Tensor) -> Tensor:
-    """Sum over the first axis of left[i] * right[i], term by term."""
-    total = left[0] * right[0]
-    for i in range(1, left.shape[0]):
-        total += left[i] * right[i]
+    """Sum over the first axis of left[i] * right[i], without the products' memory at once."""
+    pairs = zip(left.unbind(0), right.unbind(0), strict=True)
+    first, second = next(pairs)
+    total = first * second
+    for first, second in pairs:
+        total += first * second
     return total
 
 
-def _dot_basis(basis: Tensor, vector: Tensor) -> Tensor:
+def _dot_slots(slot_vectors: Tensor, vector: Tensor) -> Tensor:
     """Inner product of each slot's vector (`s k b`) with one vector (`k b`)."""
-    return _dot(basis.transpose(0, 1), vector)
-
-
-def _subtract_combination(vector: Tensor, weights: Tensor, slot_vectors: Tensor) -> Tensor:
-    for i in range(slot_vectors.shape[0]):
-        vector = vector - weights[i] * slot_vectors[i]
-    return vector
-
-
-def _norm(vector: Tensor) -> Tensor:
-    return _sum(vector.abs())
-
-
-def _minimum(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Minimum over the first axis and the lowest index that attains it."""
-    smallest = values[0]
-    index = torch.zeros_like(smallest, dtype=torch.int64)
-    for i in range(1, values.shape[0]):
-        better = values[i] < smallest
-        smallest = torch.where(better, values[i], smallest)
-        index = torch.where(better, i, index)
-    return smallest, index
+    return _sum((slot_vectors * vector).transpose(0, 1))

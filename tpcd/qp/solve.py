@@ -94,10 +94,7 @@ def _assemble(problem: ContactQP, whitened: WhitenedQP, answer: ActiveSet) -> QP
     nan = float("nan")
     status = torch.where(valid, answer.status, int(Status.INVALID_INPUT))
     answered = valid & (status != int(Status.INFEASIBLE))
-    active = torch.zeros_like(whitened.offsets, dtype=torch.bool)
-    for chosen in answer.slots:
-        held = (chosen >= 0) & answered
-        active[chosen[held], held.nonzero()[:, 0]] = True
+    active = answer.active & answered
     multipliers = answer.multipliers / whitened.lengths
     return QPSolution(
         motion=motion.where(answered, nan).T.reshape(*batch, n).to(dtype),

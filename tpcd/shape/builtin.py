@@ -231,7 +231,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "toothbrush": _entry(
         tools.toothbrush,
-        "ISO 20126 adult brush",
+        "adult toothbrush, 190 mm",
         edge=1,
         length=190,
         handle=14,

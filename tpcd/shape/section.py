@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 MESH_ENDINGS = (".ply", ".stl", ".obj")
 GRID = 1e-9
 """Ends of neighbouring pieces of a cut are matched on this grid [m]."""
-SILHOUETTE_GRID = 1e-7
-"""Grid on which projected triangles are united [m]."""
+SMALLEST_TRIANGLE = 1e-14
+"""Projected triangles below this area are seen edge on [m^2]."""
 NUDGES = (0.0, 1e-6, -1e-6, 3e-6, -3e-6)
 """Shifts of the plane in mesh sizes, tried in turn: a plane that holds a face or an edge of
 the mesh cuts it in no clean loop, one beside it does."""
@@ -174,9 +174,15 @@ def mesh_silhouette(
     """
     across, up, _ = plane.axes()
     corners = (np.asarray(mesh.triangles) - plane.origin) @ np.stack((across, up), axis=1)
-    triangles = shapely.polygons(corners)
-    triangles = triangles[shapely.area(triangles) > SILHOUETTE_GRID**2]
-    shadow = shapely.union_all(triangles, grid_size=SILHOUETTE_GRID)
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
+    if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0):
+        area = np.abs(area)  # of a closed mesh the faces that look at the viewer cover all
+    facing = corners[area > SMALLEST_TRIANGLE]
+    if not len(facing):
+        blame = path if path is not None else f"mesh '{name}'"
+        raise OutlineError(blame, "no face is seen from that side", "choose another plane")
+    shadow = shapely.union_all(shapely.polygons(facing))
     pieces = list(getattr(shadow, "geoms", [shadow]))
     largest = max(pieces, key=lambda piece: shapely.Polygon(piece.exterior).area)
     return make_outline(

@@ -1,0 +1,75 @@
+"""Download the YCB meshes and cut them into outlines.
+
+    python scripts/fetch_ycb.py ../shared/ycb
+    python scripts/fetch_ycb.py ~/ycb --objects 006_mustard_bottle 025_mug
+
+Set TPCD_YCB to the folder afterwards (`../shared/ycb` beside the repository is found by
+itself). Run it again after a broken connection: it goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tpcd.cli import run
+
+
+@dataclass(frozen=True)
+class Fetching:
+    """Settings of the download."""
+
+    folder: Path
+    """Folder to fill with meshes, outlines and a manifest of checksums."""
+    objects: tuple[str, ...] = ()
+    """Names of YCB objects; the 21 of YCB-Video where none are given."""
+    base_url: str = "https://ycb-benchmarks.s3.amazonaws.com/data/google/"
+    """Where the archives <object>_google_16k.tgz are."""
+    attempts: int = 5
+    """Tries for each file before giving up."""
+    timeout_s: float = 30.0
+    """Silence of the server that ends a try [s]."""
+
+
+def fetch(config: Fetching) -> int:
+    """Download YCB meshes (CC BY 4.0) from the set's own site and cut them into outlines."""
+    from tqdm import tqdm
+
+    from tpcd.errors import FileError
+    from tpcd.shape.download import Patience
+    from tpcd.shape.ycb import GRASPABLE_21
+    from tpcd.shape.ycb_archive import fetch_object, write_slices
+
+    names = config.objects or GRASPABLE_21
+    patience = Patience(attempts=config.attempts, timeout_s=config.timeout_s)
+    failed = []
+    for name in names:
+        with tqdm(desc=name, unit="B", unit_scale=True, leave=False) as bar:
+
+            def show(done: int, total: int | None, bar: tqdm = bar) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            try:
+                new = fetch_object(
+                    name,
+                    config.folder,
+                    base_url=config.base_url,
+                    patience=patience,
+                    progress=show,
+                )
+                outcome = "downloaded" if new else "already there"
+            except FileError as error:
+                outcome = f"failed: {error}"
+                failed.append(name)
+        print(f"{name}: {outcome}")
+    if len(failed) == len(names):
+        raise FileError(config.folder, "nothing was downloaded", "see the lines above")
+    for name, problem in write_slices(config.folder).items():
+        print(f"{name}: no outline: {problem}")
+    print(f"outlines are in {config.folder / 'slices.npz'}; export TPCD_YCB={config.folder}")
+    return 2 if failed else 0
+
+
+if __name__ == "__main__":
+    run(fetch, Fetching, positional=("folder",))

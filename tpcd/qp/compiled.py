@@ -24,9 +24,14 @@ rows[i]·w + offsets[i] >= 0 for i < m, with the arrays (all float64, C-contiguo
 
 `status` is an int code of `Status`: SOLVED, INFEASIBLE or ITERATION_LIMIT. What
 `solve_whitened_3` found INFEASIBLE, `solve_elastic_3` answers (it allocates).
+
+`no_type_check` keeps the tests' import hook, which wraps functions, away from what numba
+compiles.
 """
 
 from __future__ import annotations
+
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -44,6 +49,7 @@ _SAFE_SQUARE = 0.25
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def solve_whitened_3(rows, offsets, magnitudes, m, motion, multipliers, slots, work):
     """Solve one whitened problem of 3 variables; arrays as in the file's opening."""
     return solve_rows(
@@ -52,6 +58,7 @@ def solve_whitened_3(rows, offsets, magnitudes, m, motion, multipliers, slots, w
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def solve_whitened(rows, offsets, magnitudes, m, n, limit, motion, multipliers, slots, work):
     """Solve one whitened problem of n variables with room for min(n, m) slots.
 
@@ -64,6 +71,7 @@ def solve_whitened(rows, offsets, magnitudes, m, n, limit, motion, multipliers, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def normalise_rows(rows, offsets, magnitudes, lengths, m):
     """Divide m whitened rows, offsets and magnitudes by the rows' lengths, in place."""
     n = rows.shape[1]
@@ -82,6 +90,7 @@ def normalise_rows(rows, offsets, magnitudes, lengths, m):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def solve_elastic_3(rows, offsets, magnitudes, m, motion, multipliers, slots):
     """Answer one infeasible whitened problem by the elastic fallback of elastic.py.
 
@@ -125,6 +134,7 @@ def solve_elastic_3(rows, offsets, magnitudes, m, motion, multipliers, slots):
 
 
 @njit(inline="always", error_model="numpy")
+@no_type_check
 def solve_rows(rows, offsets, magnitudes, m, n, s, limit, motion, multipliers, slots, work):
     """Dual active set of m unit rows in n variables; see `solve_whitened_3` for the arrays.
 

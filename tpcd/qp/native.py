@@ -7,6 +7,8 @@ lock. Import this module only where numba is installed.
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from numba import njit
@@ -77,6 +79,7 @@ def _mask(problem: ContactQP, count: int, m: int) -> np.ndarray:
 
 
 @njit(inline="always", error_model="numpy")
+@no_type_check
 def _solve_batch(
     hessian, asymmetry, target, rows, offsets, mask, compliance, limit, n, k, s, yields, answer
 ):
@@ -185,6 +188,7 @@ def _solve_batch(
 
 
 @njit(inline="always", error_model="numpy")
+@no_type_check
 def _factorise(hessian, n, asymmetry, factor, inverse):
     """Lower Cholesky factor of the symmetric part and 1 / its diagonal; whether it exists."""
     definite = True
@@ -209,6 +213,7 @@ def _factorise(hessian, n, asymmetry, factor, inverse):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def _solve_batch_3(hessian, asymmetry, target, rows, offsets, mask, limit, answer):
     _solve_batch(
         hessian, asymmetry, target, rows, offsets, mask, offsets, limit, 3, 3, 3, False, answer
@@ -216,6 +221,7 @@ def _solve_batch_3(hessian, asymmetry, target, rows, offsets, mask, limit, answe
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def _solve_batch_n(hessian, asymmetry, target, rows, offsets, mask, compliance, limit, answer):
     n, m = target.shape[1], offsets.shape[1]
     yields = compliance.size > 0

@@ -86,7 +86,11 @@ def read_episode(path: str | Path) -> Episode:
     is expected and what to do.
     """
     table_path, header_path = _locate(Path(path))
-    header = read_header(header_path)
+    return read_rows(table_path, read_header(header_path))
+
+
+def read_rows(table_path: Path, header: Header) -> Episode:
+    """The table of an episode whose YAML has been read; raises as `read_episode` does."""
     table = read_table(table_path, COLUMNS)
     check_steps(table_path, table["step"])
     commands, poses, wrenches = (
@@ -118,16 +122,26 @@ def write_episode(
     """Write the pair NAME.csv (or .parquet) and NAME.yaml; returns the path of the table.
 
     `path` is NAME with or without suffix; the folder is made if needed. Both files appear
-    complete or not at all. Raises `EpisodeError` if a file of that name exists and
-    `overwrite` is false, or if the content breaks the format.
+    complete or not at all. Raises `EpisodeError` if an episode of that name exists in any
+    format and `overwrite` is false, or if the content breaks the format.
+    """
+    contents = episode_contents(episode, path, format)
+    write_together(contents, overwrite)
+    return next(iter(contents))
+
+
+def episode_contents(
+    episode: Episode, path: str | Path, format: Literal["csv", "parquet"] = "csv"
+) -> dict[Path, bytes | None]:
+    """What the files of an episode hold: table, YAML, and None for the other format's table.
+
+    Raises `EpisodeError` if the content breaks the format, `ValueError` for another format.
     """
     if format not in ("csv", "parquet"):
         raise ValueError(f"format is {format!r}, expected 'csv' or 'parquet'")
     stem = _stem(Path(path))
     table_path, header_path = _add(stem, f".{format}"), _add(stem, ".yaml")
-    commands, poses, wrenches = (
-        value.numpy() for value in (episode.commands, episode.poses, episode.wrenches)
-    )
+    other_path = _add(stem, ".csv" if format == "parquet" else ".parquet")
     header = Header(
         stiffness=tuple(episode.stiffness.tolist()),
         sensor_std=tuple(episode.sensor_std.tolist()),
@@ -138,50 +152,54 @@ def write_episode(
     )
     header_bytes = encode_header(header)
     parse_header(yaml.safe_load(header_bytes), header_path)
+    commands, poses, wrenches = (
+        value.numpy() for value in (episode.commands, episode.poses, episode.wrenches)
+    )
     table: Table = {"step": np.arange(len(episode), dtype=np.int64)}
+    check_steps(table_path, table["step"])
+    check_rows(table_path, commands, poses, wrenches, episode.sensor_std.numpy())
     for names, values in (
         (COMMAND_COLUMNS, commands),
         (POSE_COLUMNS, poses),
         (WRENCH_COLUMNS, wrenches),
     ):
         table.update({name: values[:, axis] for axis, name in enumerate(names)})
-    check_steps(table_path, table["step"])
-    check_rows(table_path, commands, poses, wrenches, episode.sensor_std.numpy())
-    other_path = _add(stem, ".csv" if format == "parquet" else ".parquet")
-    for existing in (table_path, other_path, header_path):
-        if existing.exists() and not overwrite:
-            raise EpisodeError(existing, "exists already", "choose another name or overwrite")
-    write_together(
-        {
-            header_path: header_bytes,
-            table_path: encode_table({**table, **episode.extra}, table_path),
-        }
-    )
-    other_path.unlink(missing_ok=True)
-    return table_path
+    table_bytes = encode_table({**table, **episode.extra}, table_path)
+    return {table_path: table_bytes, header_path: header_bytes, other_path: None}
 
 
-def write_together(contents: dict[Path, bytes]) -> None:
-    """Write several files so that all appear complete or, on failure, all stay as they were."""
+def write_together(contents: dict[Path, bytes | None], overwrite: bool = True) -> None:
+    """Write several files so that all appear complete or, on failure, all stay as they were.
+
+    None removes a file. Raises `EpisodeError` if one exists and `overwrite` is false.
+    """
+    for path in contents:
+        if path.exists() and not overwrite:
+            raise EpisodeError(path, "exists already", "choose another name or overwrite")
     staged: dict[Path, Path] = {}
-    backups: dict[Path, bytes | None] = {}
+    before: dict[Path, bytes | None] = {}
     try:
         for path, content in contents.items():
+            if content is None:
+                continue
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
             staged[path] = Path(name)
             with os.fdopen(handle, "wb") as file:
                 file.write(content)
             os.chmod(name, 0o644)
-        for path, temporary in staged.items():
-            backups[path] = path.read_bytes() if path.exists() else None
-            os.replace(temporary, path)
+        for path in contents:
+            before[path] = path.read_bytes() if path.exists() else None
+            if path in staged:
+                os.replace(staged[path], path)
+            else:
+                path.unlink(missing_ok=True)
     except BaseException:
-        for path, before in backups.items():
-            if before is None:
+        for path, content in before.items():
+            if content is None:
                 path.unlink(missing_ok=True)
             else:
-                path.write_bytes(before)
+                path.write_bytes(content)
         raise
     finally:
         for temporary in staged.values():

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -89,14 +90,12 @@ class MujocoTruth:
         )
         self._model = self._mujoco.MjModel.from_xml_string(xml)
         self._data = self._mujoco.MjData(self._model)
+        self._isolated = self._mujoco.MjData(self._model)
         self._command = np.zeros(3)
-        self.reset(torch.zeros(3, dtype=torch.float64))
 
     def reset(self, pose: Float[Tensor, " 3"]) -> None:
         """Put the arm at rest at a pose with the command equal to it [m, m, rad]."""
-        self._mujoco.mj_resetData(self._model, self._data)
-        self._data.qpos[:] = pose.numpy()
-        self._command = self._data.qpos.copy()
+        self._command = self._rest(self._data, pose)
 
     def step(self, command: Float[Tensor, " 3"]) -> Transition:
         """Ramp from the last command to this one and hold until the arm stands still.
@@ -104,37 +103,44 @@ class MujocoTruth:
         Returns pose [m, m, rad], wrench K (pose - command) [N, N, N·m] and whether the arm
         settled within `hold_time`.
         """
-        mujoco, model, data, settings = self._mujoco, self._model, self._data, self.settings
-        start, end = self._command, command.numpy().astype(np.float64)
+        start, self._command = self._command, command.numpy().astype(np.float64)
+        return self._move(self._data, start, self._command)
+
+    def step_from(self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]) -> Transition:
+        """One transition from rest at `pose`, the command starting there; keeps the state."""
+        start = self._rest(self._isolated, pose)
+        return self._move(self._isolated, start, command.numpy().astype(np.float64))
+
+    def contact_wrench(self) -> Float[Tensor, " 3"]:
+        """Wrench summed from the contact forces after the last `step`, which gives K (x' - u)."""
+        self._mujoco.mj_forward(self._model, self._data)
+        return torch.from_numpy(self._data.qfrc_constraint.copy())
+
+    def _rest(self, data: Any, pose: Tensor) -> np.ndarray:
+        self._mujoco.mj_resetData(self._model, data)
+        data.qpos[:] = pose.numpy()
+        return data.qpos.copy()
+
+    def _move(self, data: Any, start: np.ndarray, end: np.ndarray) -> Transition:
+        advance, settings = self._mujoco.mj_step, self.settings
         ramp_steps = max(1, round(settings.ramp_time / settings.time_step))
         for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
             data.ctrl[:] = start + fraction * (end - start)
-            mujoco.mj_step(model, data)
+            advance(self._model, data)
         damping = self._stiffness * settings.damping_time
         block = max(1, round(0.05 / settings.time_step))
         settled = False
         for _ in range(max(1, round(settings.hold_time / settings.time_step / block))):
             before = data.qpos.copy()
-            mujoco.mj_step(model, data, block)
+            advance(self._model, data, block)
             # The mean speed over the block, so that a chattering contact counts as at rest.
             speed = np.abs(data.qpos - before) / (block * settings.time_step)
             if (damping * speed).max() < settings.settled_force:
                 settled = True
                 break
-        self._command = end
         pose = data.qpos.copy()
         wrench = self._stiffness * (pose - end)
         return torch.from_numpy(pose), torch.from_numpy(wrench), settled
-
-    def step_from(self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]) -> Transition:
-        """One transition from rest at `pose`, the command starting there; see `step`."""
-        self.reset(pose)
-        return self.step(command)
-
-    def contact_wrench(self) -> Float[Tensor, " 3"]:
-        """Wrench summed from the contact forces of the last step; `step` gives K (x' - u)."""
-        self._mujoco.mj_forward(self._model, self._data)
-        return torch.from_numpy(self._data.qfrc_constraint.copy())
 
 
 def _load_mujoco() -> ModuleType:

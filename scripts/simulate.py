@@ -1,0 +1,175 @@
+"""Make episodes in simulation: an outline in the hand, a random scene, a motion, noise.
+
+python scripts/simulate.py --outline mug --out runs/mug
+python scripts/simulate.py --outline 006_mustard_bottle --policy test --episodes 3 --out runs/m
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tpcd.cli import run
+
+if TYPE_CHECKING:
+    import torch
+
+    from tpcd.shape.outline import Outline
+
+SCENE_STREAM, EPISODE_STREAM = 0, 1
+"""Independent random streams, so that the scene depends on the seed alone."""
+
+TOUCHING = 2e-4
+"""Clearance under which the summary counts a step as touching [m]."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What to simulate; equal seeds give equal scenes, whatever the motion and noise."""
+
+    outline: str
+    """Name of a built-in or YCB outline, or a file (.npz, .csv, .svg or a mesh)."""
+    out: Path
+    """Folder for the episodes NAME.csv, NAME.yaml and their NAME.truth.csv, .truth.yaml."""
+    truth: Literal["quasistatic", "mujoco"] = "mujoco"
+    """Who decides what happens: the project's own model, or MuJoCo independent of it."""
+    policy: Literal["rich", "press_and_slide", "test"] = "rich"
+    """Motion: touch-driven exploration, the paper's basic one, or a smooth test trajectory."""
+    steps: int = 15
+    """Commands after the start pose of each episode."""
+    episodes: int = 1
+    """Number of episodes, all from the same start pose in the same scene."""
+    seed: int = 0
+    """Seed of scene, motion and noise."""
+    name: str | None = None
+    """Name of the episodes (default: the policy); several are numbered."""
+    noise_position: float = 2e-4
+    """Standard deviation of the measured x and z [m]."""
+    noise_angle: float = 5e-4
+    """Standard deviation of the measured angle [rad]."""
+    noise_force: float = 0.3
+    """Standard deviation of the measured forces [N]."""
+    noise_torque: float = 0.02
+    """Standard deviation of the measured torque [N·m]."""
+    stiffness: tuple[float, float, float] = (100.0, 100.0, 50.0)
+    """Stiffness of the arm along x, z [N/m] and about y [N·m/rad]."""
+    scale: float | None = None
+    """Scale of the object instead of a random one."""
+    mount_x: float | None = None
+    """x of the object in the hand instead of a random one [m]."""
+    mount_z: float | None = None
+    """z of the object in the hand instead of a random one [m]."""
+    mount_phi: float | None = None
+    """Angle of the object in the hand instead of a random one [rad]."""
+    friction: float | None = None
+    """Friction coefficient instead of a random one."""
+    floor_height: float | None = None
+    """World z of the floor instead of a random one [m]."""
+    wall_position: float | None = None
+    """World x of the wall instead of a random one [m]."""
+    start: tuple[float, ...] = ()
+    """Start pose x z phi instead of one 10 to 20 mm above the floor [m, m, rad]."""
+    format: Literal["csv", "parquet"] = "csv"
+    """Format of the episode's table."""
+    overwrite: bool = False
+    """Replace episodes of the same name."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
+        if len(self.start) not in (0, 3):
+            raise ValueError(f"start has {len(self.start)} numbers, expected x z phi")
+
+
+def simulate(config: Simulation) -> None:
+    """Simulate episodes of an object in the hand that touches a floor and a wall."""
+    import numpy as np
+    import torch
+
+    from tpcd.data.episode import write_together
+    from tpcd.parameters import SCENE_NAMES
+    from tpcd.truth.recording import make_motion, record, recording_contents
+    from tpcd.truth.scene import draw_scene, make_truth
+
+    torch.set_num_threads(1)
+    outline = find_outline(config.outline)
+    given = {name: getattr(config, name) for name in SCENE_NAMES}
+    scene = draw_scene(
+        outline.name,
+        outline.vertices,
+        _generator(config.seed, SCENE_STREAM),
+        fixed={name: value for name, value in given.items() if value is not None},
+        stiffness=config.stiffness,
+        start_pose=config.start or None,
+    )
+    theta = " · ".join(f"{name} {value:.4g}" for name, value in scene.theta.items())
+    print(f"{outline.name}: {theta}")
+    position, angle = config.noise_position, config.noise_angle
+    force, torque = config.noise_force, config.noise_torque
+    sensor_std = torch.tensor(
+        [position, position, angle, force, force, torque], dtype=torch.float64
+    )
+    truth = make_truth(scene, config.truth)
+    name = config.name or config.policy
+    notes = f"simulated, truth {config.truth}, motion {config.policy}, seed {config.seed}"
+    contents, lines = {}, []
+    for episode in range(config.episodes):
+        stem = config.out / (name if config.episodes == 1 else f"{name}_{episode}")
+        generator = _generator(
+            config.seed, EPISODE_STREAM, episode, *np.frombuffer(config.policy.encode(), np.uint8)
+        )
+        motion = make_motion(config.policy, scene, config.steps, generator)
+        recording = record(truth, scene, motion, config.steps, generator, sensor_std, notes=notes)
+        contents.update(recording_contents(recording, scene, stem, config.format))
+        reach = [scene.clearances(pose) for pose in recording.true.poses[1:]]
+        lines.append(
+            f"{stem}.{config.format}: {config.steps} steps,"
+            f" {sum(floor < TOUCHING for floor, _ in reach)} touch the floor,"
+            f" {sum(wall < TOUCHING for _, wall in reach)} the wall,"
+            f" {recording.settled.count(False)} did not settle"
+        )
+    write_together(contents, config.overwrite)
+    print("\n".join(lines))
+
+
+def find_outline(name: str) -> Outline:
+    """The outline of a file or of a built-in or YCB name; `ValueError` if there is none."""
+    import difflib
+
+    from tpcd.shape.builtin import builtin_outlines
+    from tpcd.shape.sources import load_outlines
+    from tpcd.shape.ycb import load_ycb, ycb_folder
+
+    if Path(name).suffix and not name.startswith("0"):
+        outlines = load_outlines(name)
+        if len(outlines) != 1:
+            raise ValueError(
+                f"{name} holds {len(outlines)} outlines ({', '.join(list(outlines)[:6])}, …),"
+                " expected one; save the one you mean to its own file"
+            )
+        return next(iter(outlines.values()))
+    outlines = builtin_outlines()
+    if name not in outlines and ycb_folder() is not None:
+        outlines = {**outlines, **load_ycb("all")}
+    if name not in outlines:
+        close = difflib.get_close_matches(name, outlines, 4, 0.4)
+        raise ValueError(
+            f"no outline {name!r}; did you mean {', '.join(close or sorted(outlines)[:6])}?"
+            " Give a built-in name, a YCB name, or a file"
+        )
+    return outlines[name]
+
+
+def _generator(*entropy: int) -> torch.Generator:
+    """A torch generator for a stream that is named by whole numbers."""
+    import numpy as np
+    import torch
+
+    state = np.random.SeedSequence([int(number) for number in entropy]).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+
+
+if __name__ == "__main__":
+    run(simulate, Simulation)

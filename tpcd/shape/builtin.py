@@ -39,8 +39,11 @@ class Entry:
     """Radius of the edges [mm]."""
 
 
-def _entry(maker: Callable[..., Polygon], source: str, edge: float = 2.0, **sizes: float) -> Entry:
-    return Entry(maker=maker, dimensions=sizes, source=source, edge=edge)
+def _entry(
+    maker: Callable[..., Polygon], source: str, edge: float | int = 2, **sizes: float | int
+) -> Entry:
+    dimensions = {key: float(size) for key, size in sizes.items()}
+    return Entry(maker=maker, dimensions=dimensions, source=source, edge=float(edge))
 
 
 _PRODUCT = "typical retail product"
@@ -325,8 +328,9 @@ def random_outlines(count: int, rng: np.random.Generator, spread: float = 0.25) 
 
 def _draw_variant(name: str, entry: Entry, rng: np.random.Generator, spread: float) -> Outline:
     for _ in range(ATTEMPTS):
+        variant = vary(entry, rng, spread)
         try:
-            return make_entry(name, vary(entry, rng, spread))
+            return make_entry(name, variant)
         except (ValueError, OutlineError):
             continue
     raise RuntimeError(f"no valid variant of {name} in {ATTEMPTS} draws at spread {spread}")

@@ -14,13 +14,15 @@ import shapely
 from shapely import affinity
 from shapely.geometry import MultiPolygon, Polygon
 
+Number = float | int
+"""A coordinate or length [mm]."""
 ARC_SEGMENTS = 32
 """Straight pieces per quarter of a circle: 0.03 mm from true at 50 mm radius."""
 STATIONS = 24
 """Stations along a smooth ramp of a profile."""
 
 
-def rounded(shape: Polygon, radius: float) -> Polygon:
+def rounded(shape: Polygon, radius: Number) -> Polygon:
     """Round convex and concave corners with a radius [mm]; the outer boundary only.
 
     A morphological opening and closing. Where the opening would break a part thinner than
@@ -47,29 +49,29 @@ def union(*parts: Polygon) -> Polygon:
     return outer(joined)
 
 
-def filleted(shape: Polygon, radius: float) -> Polygon:
+def filleted(shape: Polygon, radius: Number) -> Polygon:
     """Fill concave corners with a radius [mm]; convex ones stay as they are."""
     filled = shape.buffer(radius, quad_segs=ARC_SEGMENTS)
     return outer(filled.buffer(-radius, quad_segs=ARC_SEGMENTS))
 
 
-def rectangle(left: float, bottom: float, right: float, top: float) -> Polygon:
+def rectangle(left: Number, bottom: Number, right: Number, top: Number) -> Polygon:
     return shapely.box(left, bottom, right, top)
 
 
-def oval(x: float, z: float, width: float, height: float) -> Polygon:
+def oval(x: Number, z: Number, width: Number, height: Number) -> Polygon:
     circle = shapely.Point(0, 0).buffer(0.5, quad_segs=ARC_SEGMENTS)
     return affinity.translate(affinity.scale(circle, width, height, origin=(0, 0)), x, z)
 
 
-def revolved(stations: Sequence[tuple[float, float]]) -> Polygon:
+def revolved(stations: Sequence[tuple[Number, Number]]) -> Polygon:
     """The silhouette of a body of revolution: stations (radius, height) from the bottom up."""
     right = [(radius, height) for radius, height in stations]
     return Polygon([*right, *((-radius, height) for radius, height in reversed(right))])
 
 
 def eased(
-    low: float, low_radius: float, high: float, high_radius: float
+    low: Number, low_radius: Number, high: Number, high_radius: Number
 ) -> list[tuple[float, float]]:
     """Stations of a cosine ramp from one radius to another."""
     share = np.linspace(0, 1, STATIONS)

@@ -10,13 +10,13 @@ are positive outside, computed by shapely; the torch counterpart is `polygon.Pol
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import shapely
 from jaxtyping import Float, Float64
+from numpy.typing import ArrayLike
 
 from tpcd.errors import OutlineError
 
@@ -70,7 +70,7 @@ class Outline:
 
 def make_outline(
     name: str,
-    vertices: np.ndarray | Sequence[Sequence[float]],
+    vertices: ArrayLike,
     *,
     recentre: bool = True,
     path: str | Path | None = None,

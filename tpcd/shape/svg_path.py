@@ -93,7 +93,7 @@ def arc_segments(
 
 def ellipse_segments(centre: tuple[float, float], radii: tuple[float, float]) -> Segments:
     """Cubics around a full ellipse with axes along x and y."""
-    return [np.array(centre) + np.array(radii) * unit for unit in _circle_cubics(0, 2 * math.pi)]
+    return [np.array(centre) + np.array(radii) * unit for unit in _circle_cubics(0.0, 2 * math.pi)]
 
 
 def flatten(segments: Segments, tolerance: float) -> np.ndarray:

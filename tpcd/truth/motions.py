@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -44,6 +44,7 @@ class History:
     stiffness: Float[Tensor, " 3"]
 
 
+@runtime_checkable
 class Motion(Protocol):
     """Something that chooses the next command from what was measured."""
 
@@ -119,7 +120,7 @@ def _rich_script(history: History, generator: torch.Generator) -> Script:
     def tilt() -> float:
         return uniform(0.10, LARGEST_TILT)
 
-    side = 1.0 if uniform(0, 1) < 0.5 else -1.0
+    side = 1.0 if uniform(0.0, 1.0) < 0.5 else -1.0
     # Down to the floor. From here on x, z are the last measured place of the hand.
     history = yield from _descend(history)
     x, z, _ = history.poses[-1].tolist()
@@ -148,7 +149,7 @@ def _rich_script(history: History, generator: torch.Generator) -> Script:
     history = yield (x + uniform(2.0, 3.0) * wall_press, z - 0.04, 0.0)
     floor_z, wall_x = _lowest_and_furthest(history)
     while True:
-        place = uniform(0, 1)
+        place = uniform(0.0, 1.0)
         on_floor, at_wall = place < 0.75, place > 0.45
         history = yield (
             wall_x + uniform(1.5, 4.5) * wall_press if at_wall else wall_x - uniform(0.02, 0.06),

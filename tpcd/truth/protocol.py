@@ -8,12 +8,13 @@ end-effector origin in world axes.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
 
+@runtime_checkable
 class Truth(Protocol):
     """One object in one scene, at one pose, answering commands."""
 

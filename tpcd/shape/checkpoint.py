@@ -1,0 +1,192 @@
+"""Prior checkpoints: a folder with `weights.safetensors` and `card.json`.
+
+The card says what the weights are (format version, architecture, names of the training
+outlines, kind of density) and what they are worth (errors, provenance). Both files are
+plain data: nothing is ever unpickled. `load_prior` answers every defect of a folder with
+one line of `CheckpointError`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from tpcd.errors import CheckpointError
+from tpcd.shape.deepsdf import Architecture, DeepSDFNetwork, DeepSDFShape
+from tpcd.shape.density import LatentDensity, MaskDensity, MixtureDensity
+
+FORMAT = "tpcd-prior"
+FORMAT_VERSION = 1
+WEIGHTS, CARD = "weights.safetensors", "card.json"
+DENSITIES: dict[str, type[MaskDensity] | type[MixtureDensity]] = {
+    "mask": MaskDensity,
+    "mixture": MixtureDensity,
+}
+_REMEDY = "export it again with `python -m training.train`, or use a shipped prior"
+
+
+def load_prior(path_or_name: str | Path) -> DeepSDFShape:
+    """Load a prior from a folder, or a shipped one by its name such as 'ycb21-z2'.
+
+    A name is looked up in ./checkpoints and in the repository's own checkpoints folder, and
+    in `evaluation` below each. The answer is in evaluation mode, float32, on the CPU, and
+    asks for no gradient of its weights.
+
+    Raises:
+        CheckpointError: no such folder, a file missing, unreadable or of another format
+            version, tensors missing, of the wrong shape, or not finite.
+    """
+    folder = find_prior(path_or_name)
+    card = _read_card(folder / CARD)
+    tensors = _read_tensors(folder / WEIGHTS, str(card.get("weights_sha256", "")))
+    try:
+        architecture = Architecture(**card["architecture"])
+        names = tuple(card["outlines"])
+        density_kind = DENSITIES[card["density"]]
+        misfit = float(card["misfit_sd_m"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(folder / CARD, f"lacks or garbles {error}", _REMEDY) from error
+    network = DeepSDFNetwork(architecture, len(names))
+    _fill(network, tensors, folder / WEIGHTS)
+    density = _density(density_kind, tensors, architecture.latent_dim, folder / WEIGHTS)
+    return DeepSDFShape(network, density, names, misfit, card)
+
+
+def save_prior(
+    folder: str | Path,
+    network: DeepSDFNetwork,
+    density: MaskDensity | MixtureDensity,
+    names: tuple[str, ...],
+    misfit_sd: float,
+    card: Mapping[str, Any],
+) -> Path:
+    """Write a prior to `folder`, replacing an older one at once; returns the folder.
+
+    `card` holds what a reader should know beyond what loading needs; keys that loading
+    needs are added here.
+    """
+    folder = Path(folder)
+    kind = next(name for name, cls in DENSITIES.items() if isinstance(density, cls))
+    tensors = {name: value.detach().float() for name, value in network.state_dict().items()}
+    tensors |= {f"density.{name}": value for name, value in density.tensors().items()}
+    weights = save({name: value.contiguous().cpu() for name, value in tensors.items()})
+    full_card = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "name": folder.name,
+        "architecture": dataclasses.asdict(network.architecture),
+        "density": kind,
+        "misfit_sd_m": misfit_sd,
+        **card,
+        "outlines": list(names),
+        "weights_sha256": hashlib.sha256(weights).hexdigest(),
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
+    try:
+        (staging / WEIGHTS).write_bytes(weights)
+        (staging / CARD).write_text(json.dumps(full_card, indent=1) + "\n", encoding="utf-8")
+        folder.mkdir(exist_ok=True)
+        for name in (WEIGHTS, CARD):
+            os.replace(staging / name, folder / name)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    return folder
+
+
+def find_prior(path_or_name: str | Path) -> Path:
+    """Folder of a prior given by path or by name; CheckpointError if there is none."""
+    given = Path(path_or_name)
+    repository = Path(__file__).resolve().parents[2] / "checkpoints"
+    candidates = [given]
+    if len(given.parts) == 1:
+        roots = (Path("checkpoints"), repository)
+        candidates += [root / sub / given for root in roots for sub in ("", "evaluation")]
+    for candidate in candidates:
+        if (candidate / CARD).is_file() or (candidate / WEIGHTS).is_file():
+            return candidate
+    shipped = sorted(card.parent.name for card in repository.glob(f"*/{CARD}"))
+    known = f"shipped priors are {', '.join(shipped)}" if shipped else "no priors are shipped here"
+    raise CheckpointError(given, f"holds no prior ({CARD} and {WEIGHTS})", known)
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise CheckpointError(path, "is missing", _REMEDY) from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(path, f"is no readable JSON ({_line(error)})", _REMEDY) from error
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise CheckpointError(path, f"is not a card of format '{FORMAT}'", _REMEDY)
+    version = card.get("format_version")
+    if version != FORMAT_VERSION:
+        raise CheckpointError(
+            path, f"has format version {version}, this program reads {FORMAT_VERSION}", _REMEDY
+        )
+    return card
+
+
+def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:
+    try:
+        data = path.read_bytes()
+        tensors = load(data)
+    except FileNotFoundError as error:
+        raise CheckpointError(path, "is missing", _REMEDY) from error
+    except (OSError, SafetensorError, ValueError) as error:
+        raise CheckpointError(path, f"is no safetensors file ({_line(error)})", _REMEDY) from error
+    if hashlib.sha256(data).hexdigest() != expected_hash:
+        raise CheckpointError(path, f"does not belong to its {CARD} (hash differs)", _REMEDY)
+    return tensors
+
+
+def _fill(network: DeepSDFNetwork, tensors: dict[str, Tensor], path: Path) -> None:
+    for name, target in network.state_dict().items():
+        value = tensors.get(name)
+        if value is None:
+            raise CheckpointError(path, f"lacks the tensor '{name}'", _REMEDY)
+        if value.shape != target.shape:
+            found, wanted = tuple(value.shape), tuple(target.shape)
+            raise CheckpointError(path, f"'{name}' has shape {found}, expected {wanted}", _REMEDY)
+        if not value.isfinite().all():
+            raise CheckpointError(path, f"'{name}' holds NaN or infinity", _REMEDY)
+    network.load_state_dict({name: tensors[name].float() for name in network.state_dict()})
+    network.requires_grad_(False).eval()
+
+
+def _density(
+    kind: type[MaskDensity] | type[MixtureDensity],
+    tensors: dict[str, Tensor],
+    latent_dim: int,
+    path: Path,
+) -> LatentDensity:
+    prefix = "density."
+    own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    try:
+        density = kind.from_tensors(own)
+        dims = density.means.shape[-1] if isinstance(density, MixtureDensity) else 2
+    except (KeyError, ValueError, IndexError) as error:
+        raise CheckpointError(path, f"lacks or garbles density tensor {error}", _REMEDY) from error
+    if dims != latent_dim:
+        raise CheckpointError(
+            path, f"has a density of {dims} dimensions for {latent_dim} latents", _REMEDY
+        )
+    if not all(torch.isfinite(value.double()).all() for value in own.values()):
+        raise CheckpointError(path, "has a density that is not finite", _REMEDY)
+    return density
+
+
+def _line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,0 +1,156 @@
+"""Prior densities of a shape latent, each with the region where the latent is valid.
+
+`MaskDensity` is uniform on the valid cells of [-1, 1]^2, as in the paper but without the
+regions that decode to nothing plausible. `MixtureDensity` is a Gaussian mixture fitted to
+the codes, truncated to the box and to its own high-density region, for latents with more
+dimensions, where a uniform box would be nearly empty of plausible outlines.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class LatentDensity(Protocol):
+    """A normalised density on the valid part of [-1, 1]^z."""
+
+    def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
+        """Whether the density is positive here."""
+        ...
+
+    def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
+        """Log density, normalised on the valid region; -inf elsewhere."""
+        ...
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
+        """Independent draws, float64 on the CPU."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What a checkpoint stores of the density."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MaskDensity:
+    """Uniform on the cells of a square grid over [-1, 1]^2 that are marked valid."""
+
+    cells: Bool[Tensor, "n n"]
+    """cells[i, j] covers z_0 in [-1 + 2i/n, -1 + 2(i+1)/n] and z_1 likewise with j."""
+
+    def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
+        """Whether the latent lies in a valid cell; NaN and outside the box are not valid."""
+        n = self.cells.shape[0]
+        inside = (latent.abs() <= 1).all(-1)
+        safe = torch.where(inside[..., None], latent, torch.zeros_like(latent))
+        index = ((safe + 1) * (n / 2)).long().clamp(0, n - 1)
+        return self.cells.to(latent.device)[index[..., 0], index[..., 1]] & inside
+
+    def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
+        """-log(valid area) in valid cells, -inf elsewhere."""
+        area = 4.0 * self.cells.double().mean().item()
+        level = torch.full_like(latent[..., 0], -math.log(area))
+        return torch.where(self.valid(latent), level, torch.full_like(level, -torch.inf))
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
+        """Uniform draws: a valid cell, then a place within it."""
+        where = self.cells.cpu().nonzero()
+        cell = torch.randint(len(where), (count,), generator=generator)
+        within = torch.rand(count, 2, generator=generator, dtype=torch.float64)
+        # A draw of exactly 1 - eps may round up across the cell's edge; stay inside.
+        within = within.clamp(1e-9, 1 - 1e-9)
+        return (where[cell] + within) * (2 / self.cells.shape[0]) - 1
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The mask as bytes."""
+        return {"cells": self.cells.to(torch.uint8)}
+
+    @staticmethod
+    def from_tensors(tensors: dict[str, Tensor]) -> MaskDensity:
+        """Inverse of `tensors`."""
+        return MaskDensity(tensors["cells"].bool())
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureDensity:
+    """Gaussian mixture cut off at the box and at a density level, then normalised."""
+
+    weights: Float[Tensor, "k"]
+    """Component weights, summing to 1."""
+    means: Float[Tensor, "k z"]
+    """Component means."""
+    factors: Float[Tensor, "k z z"]
+    """Lower Cholesky factors of the component covariances."""
+    floor: float
+    """Log of the untruncated density below which a latent is not valid."""
+    kept: float
+    """Probability that a draw of the untruncated mixture is valid (normalisation)."""
+
+    def raw_log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
+        """Log density of the untruncated mixture."""
+        means, factors = self.means.to(latent), self.factors.to(latent)
+        z = latent.shape[-1]
+        whiten = torch.linalg.solve_triangular(
+            factors, torch.eye(z).to(latent).expand_as(factors), upper=False
+        )
+        # |L^-1 (x - m)|^2 for all components by one matrix product with the stacked L^-1.
+        flat = latent.reshape(-1, z)
+        white = flat @ whiten.reshape(-1, z).mT
+        shift = (whiten @ means[..., None]).reshape(-1)
+        square = (white - shift).square().unflatten(-1, (len(means), z)).sum(-1)
+        log_scale = (
+            self.weights.to(latent).log()
+            - factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+            - 0.5 * z * math.log(2 * math.pi)
+        )
+        return torch.logsumexp(log_scale - 0.5 * square, dim=-1).reshape(latent.shape[:-1])
+
+    def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
+        """Whether the latent lies in the box and above the density floor."""
+        return (latent.abs() <= 1).all(-1) & (self.raw_log_density(latent) >= self.floor)
+
+    def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
+        """Log density normalised on the valid region, -inf elsewhere."""
+        raw = self.raw_log_density(latent)
+        valid = (latent.abs() <= 1).all(-1) & (raw >= self.floor)
+        return torch.where(valid, raw - math.log(self.kept), torch.full_like(raw, -torch.inf))
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
+        """Draws by rejection from the untruncated mixture."""
+        kept: list[Tensor] = []
+        missing = count
+        while missing > 0:
+            draws = self.raw_sample(int(missing / self.kept * 1.2) + 16, generator)
+            kept.append(draws[self.valid(draws)][:missing])
+            missing -= len(kept[-1])
+        return torch.cat(kept) if kept else torch.zeros(0, self.means.shape[-1]).double()
+
+    def raw_sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
+        """Draws of the untruncated mixture, float64 on the CPU."""
+        weights, means = self.weights.double().cpu(), self.means.double().cpu()
+        pick = torch.multinomial(weights, count, replacement=True, generator=generator)
+        noise = torch.randn(count, means.shape[-1], 1, generator=generator, dtype=torch.float64)
+        return means[pick] + (self.factors.double().cpu()[pick] @ noise)[..., 0]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Mixture and truncation, float64."""
+        return {
+            "weights": self.weights.double(),
+            "means": self.means.double(),
+            "factors": self.factors.double(),
+            "truncation": torch.tensor([self.floor, self.kept], dtype=torch.float64),
+        }
+
+    @staticmethod
+    def from_tensors(tensors: dict[str, Tensor]) -> MixtureDensity:
+        """Inverse of `tensors`."""
+        floor, kept = tensors["truncation"].tolist()
+        return MixtureDensity(
+            tensors["weights"], tensors["means"], tensors["factors"], floor, kept
+        )

@@ -1,0 +1,1 @@
+"""Training of the shape priors: outlines in, `checkpoints/NAME` out."""

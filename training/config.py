@@ -1,0 +1,124 @@
+"""What can be set about the training of a prior; YAML files hold what differs from this."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which outlines to train on."""
+
+    source: Literal["ycb21", "ycb", "builtin"] = "ycb21"
+    """`ycb21`: main outlines of 21 graspable YCB objects; `ycb`: main and extra views of all
+    YCB objects; `builtin`: the outlines made in code."""
+    smallest_size: float = 0.04
+    """Outlines whose longer side is less are not suitable [m] (not asked of `ycb21`)."""
+    largest_size: float = 0.26
+    """Outlines whose longer side is more are not suitable [m] (not asked of `ycb21`)."""
+    mirror: bool = False
+    """Also train on each outline mirrored left to right."""
+    builtin_variants: int = 0
+    """Random variants of the built-in outlines to train on as well."""
+    leave_out: list[str] = field(default_factory=list)
+    """Objects to leave out, by the beginning of their names; all their views go."""
+    only: list[str] = field(default_factory=list)
+    """If not empty, train on these names alone."""
+
+
+@dataclass(frozen=True)
+class LayoutConfig:
+    """Correspondence, initial codes and the latents in between."""
+
+    points: int = 128
+    """Points of the outline head."""
+    rounding: float = 0.001
+    """Smallest radius of a corner of the head's targets [m]."""
+    turning_share: float = 0.5
+    """Share of turning angle, against arc length, in the spacing of the points."""
+    extent: float = 0.92
+    """Largest absolute coordinate of an initial code."""
+    attempts: int = 6
+    """Site layouts to try (two dimensions); the one with the most alike neighbours wins."""
+    neighbours: int = 8
+    """Morphs combine a code with some of this many nearest codes (more dimensions)."""
+    between: int = 8000
+    """Latents in between to train on."""
+    object_samples: int = 8000
+    """Points with known signed distance around each outline."""
+    between_samples: int = 120
+    """Points with known signed distance around each outline in between."""
+    near_spread: float = 0.0015
+    """Standard deviation of the points near the outline [m]."""
+    far_spread: float = 0.012
+    """Standard deviation of the points further from the outline [m]."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the networks and the frequencies that they start with."""
+
+    latent_dim: int = 2
+    """Size z of the latent."""
+    sdf_width: int = 128
+    """Units of each hidden layer of the signed distance."""
+    sdf_depth: int = 4
+    """Hidden layers of the signed distance."""
+    head_width: int = 128
+    """Units of each hidden layer of the outline head."""
+    head_depth: int = 3
+    """Hidden layers of the outline head."""
+    point_frequency: float = 8.0
+    """Largest initial first-layer weight on a coordinate in units of 0.1 m."""
+    latent_frequency: float = 3.0
+    """Largest initial first-layer weight on a latent entry, in the signed distance."""
+    head_frequency: float = 5.0
+    """Largest initial first-layer weight on a latent entry, in the head."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Optimiser and loss weights. Muon moves the hidden matrices, Adam everything else."""
+
+    steps: int = 3000
+    """Optimiser steps."""
+    batch: int = 2048
+    """Points of a step, half around the outlines and half in between."""
+    adam_rate: float = 5e-3
+    """Peak learning rate of Adam."""
+    muon_rate: float = 0.03
+    """Peak learning rate of Muon; with Adam alone the error after as many steps was three
+    times as large (21 outlines, 1000 steps)."""
+    code_rate: float = 1e-3
+    """Peak learning rate of the codes (Adam)."""
+    gradient_weight: float = 0.3
+    """Weight of |grad f - normal|^2 near the outline; it holds both eikonal and direction."""
+    head_weight: float = 10.0
+    """Weight of the squared distance of the head's points from their targets."""
+    consistency_weight: float = 30.0
+    """Weight of f(g(z); z)^2, from one third of the training on."""
+    head_batch: int = 256
+    """Latents of a step for the head's targets."""
+    consistency_batch: int = 24
+    """Latents of a step for f(g(z); z)^2."""
+    seed: int = 0
+    """Seed of every random draw."""
+    threads: int = 2
+    """Torch threads."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One prior."""
+
+    name: str = "prior"
+    """Folder of the checkpoint below `checkpoints`."""
+    data: DataConfig = field(default_factory=DataConfig)
+    """Which outlines."""
+    layout: LayoutConfig = field(default_factory=LayoutConfig)
+    """How they are arranged."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Which networks."""
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    """How they learn."""

@@ -1,0 +1,165 @@
+"""Lightning's model side: networks, losses and two optimisers.
+
+Loss = mean w |f - d| + gradient_weight |grad f - n|^2 (near)         distance and normals
+     + head_weight |g - target|^2 + consistency_weight f(g(z); z)^2    outline head
+with exact distances d and normals n, w = 1 / (|d| + 5 mm). Every expectation runs over
+the outlines (learned codes: an auto-decoder) and over the latents between them, whose
+codes are fixed convex combinations of the learned ones and move with them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from tpcd.shape.deepsdf import UNIT, Architecture, DeepSDFNetwork
+from training.config import TrainingConfig
+from training.data import Batch, Prepared
+
+NEAR = 0.03
+"""Distance up to which the gradient of f counts fully [m]."""
+FAR_WEIGHT = 0.3
+"""What it counts further away, where it keeps f from spurious level sets."""
+SOFTENING = 0.005
+"""Errors count in proportion to 1 / (distance + this) [m]."""
+WARM_UP = 50
+"""Steps over which the learning rates rise."""
+
+
+class PriorModule(LightningModule):
+    """Trains one `DeepSDFNetwork`."""
+
+    def __init__(self, prepared: Prepared, config: TrainingConfig) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.data, self.config = prepared, config
+        self.network = initial_network(prepared, config)
+
+    def between_latents(self) -> Float[Tensor, "m z"]:
+        """Current latents in between; they follow the codes."""
+        return self.data.between @ torch.cat((self.network.codes, self.data.border))
+
+    def training_step(self, batch: Batch, batch_index: int) -> None:
+        """One step of both optimisers."""
+        terms = self.loss_terms(batch, batch_index >= self.config.optim.steps // 3)
+        loss = torch.stack(list(terms.values())).sum()
+        optimizers = self.optimizers()
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        self.manual_backward(loss)
+        for optimizer, scheduler in zip(optimizers, self.lr_schedulers(), strict=True):
+            optimizer.step()
+            scheduler.step()
+        with torch.no_grad():
+            self.network.codes.clamp_(-1, 1)
+        if batch_index % 20 == 0:
+            self.log("loss", loss.detach(), prog_bar=True)
+            self.log_dict({f"loss/{name}": term.detach() for name, term in terms.items()})
+
+    def loss_terms(self, batch: Batch, consistent: bool) -> dict[str, Tensor]:
+        """Weighted terms of the loss; `consistent` adds f(g(z); z)^2."""
+        data, optim, network = self.data, self.config.optim, self.network
+        nodes = torch.cat((network.codes, data.border))
+        terms = self._distance_terms(batch, data.between[batch.between] @ nodes)
+        # The head learns where the latents are; it does not move them.
+        latents, codes = self.between_latents().detach(), network.codes.detach()
+        simple = data.simple[batch.head].float()
+        between_error = (network.outline(latents[batch.head]) - data.morphs[batch.head]).square()
+        object_error = (network.outline(codes) - data.targets).square()
+        terms["head"] = optim.head_weight * (
+            (between_error.sum(-1).mean(-1) * simple).mean() + object_error.sum(-1).mean()
+        )
+        if consistent:
+            z = latents[batch.consistency]
+            value = network.distance(network.outline(z), z).square().mean(-1)
+            value = (value * data.simple[batch.consistency]).mean()
+            at_codes = network.distance(network.outline(codes), codes).square().mean()
+            terms["consistency"] = optim.consistency_weight * (value + at_codes)
+        return terms
+
+    def _distance_terms(self, batch: Batch, latents: Tensor) -> dict[str, Tensor]:
+        data = self.data
+        own = (batch.outline, batch.outline_sample)
+        between = (batch.between, batch.between_sample)
+
+        def pick(name: str) -> Tensor:
+            first = getattr(data.object_samples, name)[own]
+            return torch.cat((first, getattr(data.between_samples, name)[between]))
+
+        points, distance, normal = pick("points"), pick("distance"), pick("gradient")
+        points = points.requires_grad_()
+        z = torch.cat((self.network.codes[batch.outline], latents))
+        counts = torch.ones(len(z))
+        counts[len(batch.outline) :] = data.simple[batch.between].float()
+        value = self.network.distance(points[:, None], z)[:, 0]
+        gradient = torch.autograd.grad(value.sum(), points, create_graph=True)[0]
+        weight = counts / (distance.abs() + SOFTENING / UNIT)
+        near = torch.where(distance.abs() < NEAR / UNIT, 1.0, FAR_WEIGHT) * counts
+        return {
+            "distance": (weight * (value - distance).abs()).mean(),
+            "gradient": self.config.optim.gradient_weight
+            * (near * (gradient - normal).square().sum(-1)).mean(),
+        }
+
+    def configure_optimizers(self) -> tuple[list, list]:
+        """Muon for square-ish hidden matrices, Adam for first layers, biases and codes."""
+        optim = self.config.optim
+        hidden = [
+            layer.weight
+            for mlp in (self.network.sdf[2:-1], self.network.head[2:])
+            for layer in mlp
+            if isinstance(layer, nn.Linear)
+        ]
+        taken = {id(weight) for weight in hidden} | {id(self.network.codes)}
+        others = [p for p in self.network.parameters() if id(p) not in taken]
+        groups = [
+            {"params": others, "lr": optim.adam_rate},
+            {"params": [self.network.codes], "lr": optim.code_rate},
+        ]
+        optimizers = [
+            torch.optim.Adam(groups, betas=(0.9, 0.99)),
+            torch.optim.Muon(hidden, lr=optim.muon_rate, momentum=0.95, weight_decay=0.0),
+        ]
+        schedulers = [torch.optim.lr_scheduler.LambdaLR(o, self._rate) for o in optimizers]
+        return optimizers, schedulers
+
+    def _rate(self, step: int) -> float:
+        """Linear warm-up, then half a cosine down to 0.2 %."""
+        done = min(step / self.config.optim.steps, 1.0)
+        return min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * done)) + 0.002
+
+
+def initial_network(prepared: Prepared, config: TrainingConfig) -> DeepSDFNetwork:
+    """Networks with sine-friendly initial weights (Sitzmann et al. 2020, section 3.2)."""
+    sizes = config.network
+    architecture = Architecture(
+        latent_dim=sizes.latent_dim,
+        sdf_width=sizes.sdf_width,
+        sdf_depth=sizes.sdf_depth,
+        head_width=sizes.head_width,
+        head_depth=sizes.head_depth,
+        points=config.layout.points,
+    )
+    network = DeepSDFNetwork(architecture, len(prepared.names))
+    generator = torch.Generator().manual_seed(config.optim.seed)
+    with torch.no_grad():
+        for mlp in (network.sdf, network.head):
+            for layer in mlp:
+                if isinstance(layer, nn.Linear):
+                    bound = math.sqrt(6 / layer.in_features)
+                    layer.weight.uniform_(-bound, bound, generator=generator)
+                    layer.bias.uniform_(-math.pi, math.pi, generator=generator)
+        network.sdf[0].weight.uniform_(-1, 1, generator=generator)
+        network.sdf[0].weight[:, :2].mul_(sizes.point_frequency)
+        network.sdf[0].weight[:, 2:].mul_(sizes.latent_frequency)
+        network.head[0].weight.uniform_(-1, 1, generator=generator)
+        network.head[0].weight.mul_(sizes.head_frequency)
+        for mlp in (network.sdf, network.head):
+            mlp[-1].weight.mul_(0.3)
+            mlp[-1].bias.zero_()
+        network.codes.copy_(prepared.codes)
+    return network

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import subprocess
 import sys
@@ -234,32 +235,57 @@ def test_a_recording_reads_back_with_its_truth_and_raises_no_warning(tmp_path):
         read_truth(path)
 
 
-def run_simulate(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(SIMULATE), *arguments],
-        capture_output=True, text=True, cwd=SIMULATE.parents[1],
-        env={"PYTHONPATH": str(SIMULATE.parents[1]), "OMP_NUM_THREADS": "1", "PATH": ""},
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def simulate_command():
+    """The script's door with its arguments: returns the exit code."""
+    spec = importlib.util.spec_from_file_location("simulate_script", SIMULATE)
+    script = sys.modules["simulate_script"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+
+    def call(*arguments: str) -> int:
+        with pytest.raises(SystemExit) as stopped:
+            script.run(script.simulate, script.Simulation, arguments)
+        return stopped.value.code
+
+    yield call
+    del sys.modules["simulate_script"]
 
 
-def test_the_command_makes_several_episodes_of_one_scene(tmp_path):
-    result = run_simulate(
+def test_the_command_makes_several_episodes_of_one_scene(simulate_command, tmp_path, capsys):
+    code = simulate_command(
         "--outline", "mug", "--policy", "test", "--episodes", "2", "--steps", "4",
         "--friction", "0.4", "--seed", "3", "--out", str(tmp_path / "a"),
     )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.count("4 steps") == 2
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    assert printed.out.count("4 steps") == 2
     first, second = (read_truth(tmp_path / "a" / f"test_{i}.csv") for i in (0, 1))
     assert first[1].theta == second[1].theta
     assert first[1].friction == 0.4
     assert not torch.equal(first[0].commands, second[0].commands)
-    before = (tmp_path / "a" / "test_0.csv").read_bytes()
-    again = run_simulate(
-        "--outline", "mug", "--policy", "test", "--steps", "4", "--seed", "3",
-        "--name", "test_1", "--out", str(tmp_path / "a"),
+    before = {path: path.read_bytes() for path in (tmp_path / "a").iterdir()}
+    code = simulate_command(
+        "--outline", "mug", "--policy", "test", "--steps", "4", "--seed", "3", "--episodes", "3",
+        "--out", str(tmp_path / "a"),
     )  # fmt: skip
-    assert again.returncode == 2 and "exists already" in again.stderr
-    assert (tmp_path / "a" / "test_0.csv").read_bytes() == before
+    assert code == 2 and "exists already" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
+
+
+def test_both_truths_answer_the_same_first_steps_alike(simulate_command, tmp_path):
+    """Light pressing from free space: within 0.2 mm and 0.02 N of each other."""
+    for truth in ("mujoco", "quasistatic"):
+        code = simulate_command(
+            "--outline", "soup_can", "--truth", truth, "--policy", "test", "--steps", "6",
+            "--seed", "1", "--name", truth, "--out", str(tmp_path),
+        )  # fmt: skip
+        assert code == 0
+    first, second = (
+        read_truth(tmp_path / f"{truth}.csv")[0] for truth in ("mujoco", "quasistatic")
+    )
+    assert torch.equal(first.commands, second.commands)
+    assert (first.poses - second.poses)[:, :2].abs().max() < 2e-4
+    assert (first.wrenches - second.wrenches)[:, :2].abs().max() < 2e-2
 
 
 @pytest.mark.parametrize(
@@ -273,11 +299,13 @@ def test_the_command_makes_several_episodes_of_one_scene(tmp_path):
         (("--outline", "mug", "--noise-force", "-1"), "sensor_std"),
     ],
 )
-def test_a_bad_request_gets_one_line_and_leaves_nothing(arguments, message, tmp_path):
-    result = run_simulate(*arguments, "--out", str(tmp_path / "out"))
-    assert result.returncode == 2
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
+def test_a_bad_request_gets_one_line_and_leaves_nothing(
+    arguments, message, simulate_command, tmp_path, capsys
+):
+    assert simulate_command(*arguments, "--out", str(tmp_path / "out")) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
@@ -285,7 +313,11 @@ def test_help_is_quick():
     times = []
     for _ in range(3):
         start = time.perf_counter()
-        result = run_simulate("--help")
+        result = subprocess.run(
+            [sys.executable, str(SIMULATE), "--help"],
+            capture_output=True, text=True,
+            env={"PYTHONPATH": str(SIMULATE.parents[1]), "PATH": ""},
+        )  # fmt: skip
         times.append(time.perf_counter() - start)
         assert result.returncode == 0 and "--outline" in result.stdout
     loaded = subprocess.run(

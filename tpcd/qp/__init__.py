@@ -4,6 +4,5 @@ from tpcd.qp.problem import ContactQP as ContactQP
 from tpcd.qp.problem import QPSolution as QPSolution
 from tpcd.qp.problem import Status as Status
 from tpcd.qp.solve import ENGINES as ENGINES
-from tpcd.qp.solve import Engine as Engine
 from tpcd.qp.solve import native_available as native_available
 from tpcd.qp.solve import solve as solve

@@ -7,7 +7,6 @@ fallback, the residual, units, and the gradients of differentiate.py.
 from __future__ import annotations
 
 from importlib.util import find_spec
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -19,13 +18,12 @@ from tpcd.qp.exact import ActiveSet, optimality_residual, solve_exact
 from tpcd.qp.problem import ContactQP, QPSolution, Status, check_problem, select
 from tpcd.qp.whitening import WhitenedQP, unwhiten, whiten
 
-Engine = Literal["auto", "exact", "native", "qpth"]
 ENGINES: tuple[str, ...] = ("auto", "exact", "native", "qpth")
 
 
 def solve(
     problem: ContactQP,
-    engine: Engine = "auto",
+    engine: str = "auto",
     *,
     elastic: bool = True,
     iteration_limit: int | None = None,

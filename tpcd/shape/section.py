@@ -46,7 +46,8 @@ class CuttingPlane:
 
     def __post_init__(self) -> None:
         for name in ("origin", "normal", "up"):
-            value = getattr(self, name)
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, value)
             if value.shape != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be three finite numbers, got {value}")
         if np.linalg.norm(np.cross(self.normal, self.up)) < 1e-9:

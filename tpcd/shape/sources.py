@@ -63,6 +63,8 @@ def load_slices(path: str | Path, *, unit: str = "m") -> dict[str, Outline]:
     if not path.is_file():
         raise OutlineError(path, "not found", "give an .npz file of (n, 2) arrays")
     try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("no zip archive")
         with np.load(path, allow_pickle=False) as arrays:
             slices = {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:

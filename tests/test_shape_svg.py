@@ -1,0 +1,269 @@
+"""SVG drawings: the path language against closed forms, units, transforms, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tpcd.errors import OutlineError
+from tpcd.shape.svg import load_svg
+from tpcd.shape.svg_path import arc_segments, flatten, parse_path
+
+MM = 'width="200mm" height="100mm" viewBox="0 0 200 100"'
+
+
+def drawing(tmp_path, body: str, root: str = MM):
+    path = tmp_path / "part.svg"
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {root}>{body}</svg>')
+    return path
+
+
+def single(tmp_path, body: str, root: str = MM, **options):
+    (outline,) = load_svg(drawing(tmp_path, body, root), **options).values()
+    return outline
+
+
+def refusal(path, **options) -> str:
+    with pytest.raises(OutlineError) as caught:
+        load_svg(path, **options)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message
+    return message
+
+
+def ends(path_text: str) -> list[list[list[float]]]:
+    """End points of all segments of all subpaths."""
+    return [[s[-1].round(9).tolist() for s in loop] for loop in parse_path(path_text)]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "M 10 20 L 30 20 L 30 50 Z",
+        "M10,20 30,20 30,50z",
+        "m10 20 20 0 0 30z",
+        "M10 20H30V50Z",
+        "m10 20h20v30z",
+        "M1e1 2e+1L300e-1,20L.3e2.5e2z",
+        "\n M10 20\tL30 20 30 50",
+    ],
+)
+def test_the_same_triangle_in_every_spelling(text):
+    assert ends(text) == [[[30, 20], [30, 50], [10, 20]]]
+
+
+def test_numbers_and_flags_may_touch():
+    spaced = parse_path("M10 10 A 5 5 0 0 1 20 10 L -1 -0.5 Z")
+    packed = parse_path("M10 10A5 5 0 0120 10L-1-.5Z")
+    assert len(spaced[0]) == len(packed[0])
+    for first, second in zip(spaced[0], packed[0], strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_smooth_curves_mirror_the_control_point_before():
+    ((first, second, *_),) = parse_path("M0 0C0 10 10 10 10 0S20-10 20 0")
+    np.testing.assert_allclose(second[1], 2 * first[3] - first[2])
+    ((first, second, third, *_),) = parse_path("M0 0Q5 10 10 0T20 0T30 0")
+    np.testing.assert_allclose(second[1], [15, -10])
+    np.testing.assert_allclose(third[1], [25, 10])
+
+
+def test_smooth_curves_after_another_kind_start_at_their_own_point():
+    ((_, second, *_),) = parse_path("M0 0Q5 10 10 0S20-10 20 0")
+    np.testing.assert_allclose(second[1], [10, 0])
+
+
+def test_relative_commands_after_close_go_on_from_the_start_of_the_subpath():
+    assert ends("m10 10 h5 v5 z m20 0 h5 v5 z")[1][0] == [35, 10]
+
+
+@given(
+    st.floats(1, 80),
+    st.floats(1, 80),
+    st.floats(0, 360),
+    st.booleans(),
+    st.booleans(),
+    st.floats(-50, 50),
+    st.floats(1, 50),
+)
+@settings(max_examples=100, deadline=None)
+def test_arcs_lie_on_an_ellipse_of_the_given_shape(rx, ry, degrees, large, sweep, x, y):
+    """Mapped to circles, all points keep one distance from one centre, the ends are met."""
+    start, end = np.zeros(2), np.array([x, y])
+    rotation = np.radians(degrees)
+    points = np.vstack(
+        (flatten(arc_segments(start, (rx, ry), rotation, large, sweep, end), 1e-6), end)
+    )
+    np.testing.assert_allclose(points[0], start)
+    turn = np.array([[np.cos(rotation), np.sin(rotation)], [-np.sin(rotation), np.cos(rotation)]])
+    circle = points @ turn.T / [rx, ry]
+    system = np.column_stack((2 * circle, np.ones(len(circle))))
+    centre = np.linalg.lstsq(system, (circle**2).sum(1), rcond=None)[0][:2]
+    radius = np.linalg.norm(circle - centre, axis=1)
+    assert np.ptp(radius) < 1e-3 * max(1.0, radius.mean())
+    swept = np.unwrap(np.arctan2(*(circle - centre).T[::-1]))
+    assert (swept[-1] > swept[0]) == sweep
+    half_turn_reached = abs(swept[-1] - swept[0]) > np.pi - 1e-2
+    if abs(abs(swept[-1] - swept[0]) - np.pi) > 1e-2:
+        assert half_turn_reached == large
+
+
+def test_flattened_curves_keep_the_tolerance():
+    (curve,) = parse_path("M0 0C0 100 100 100 100 0")
+    t = np.linspace(0, 1, 2001)[:, None]
+    control = curve[0]
+    true = sum(c * t**k * (1 - t) ** (3 - k) * control[k] for k, c in enumerate((1, 3, 3, 1)))
+    for tolerance in (1.0, 0.1, 0.01):
+        points = np.vstack((flatten(curve[:1], tolerance), control[-1:]))
+        start, step = points[:-1], np.diff(points, axis=0)
+        along = ((true[:, None] - start) * step).sum(-1) / (step**2).sum(-1)
+        foot = start + np.clip(along, 0, 1)[..., None] * step
+        assert np.linalg.norm(true[:, None] - foot, axis=2).min(1).max() <= tolerance
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("L 10 10", "has 'L' at character 1"),
+        ("M 10 10 X 5", "has 'X' at character 9"),
+        ("M 10", "lacks a number for 'M'"),
+        ("M 0 0 C 1 2 3 4", "lacks a number for 'C'"),
+        ("M 0 0 A 5 5 0 2 0 1 1", "lacks a number for 'A' at character 15"),
+        ("M 0 0 L 1,,b", "lacks a number for 'L'"),
+    ],
+)
+def test_bad_path_data_are_refused_with_their_place(text, expected):
+    with pytest.raises(ValueError) as caught:
+        parse_path(text)
+    assert expected in str(caught.value)
+
+
+def test_a_path_in_millimetres_becomes_metres_with_z_up(tmp_path):
+    outline = single(tmp_path, '<path id="wedge" d="M10 10 H110 V60 Z"/>')
+    assert outline.name == "wedge"
+    assert outline.size == pytest.approx((0.1, 0.05))
+    # The right angle is at the top right of the drawing, so it is right of the centroid, above.
+    corner = outline.vertices[np.argmax(outline.vertices.sum(axis=1))]
+    np.testing.assert_allclose(corner, [0.1 / 3, 0.05 / 3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("body", "size", "area"),
+    [
+        ('<rect x="5" y="5" width="100" height="40"/>', (0.1, 0.04), 0.004),
+        ('<rect width="100" height="40" rx="5"/>', (0.1, 0.04), 0.004 - (4 - np.pi) * 25e-6),
+        ('<rect width="100" height="40" ry="500"/>', (0.1, 0.04), np.pi * 0.05 * 0.02),
+        ('<circle cx="50" cy="50" r="30"/>', (0.06, 0.06), np.pi * 9e-4),
+        ('<ellipse cx="50" cy="50" rx="40" ry="20"/>', (0.08, 0.04), np.pi * 8e-4),
+        ('<polygon points="0,0 100,0 100,50"/>', (0.1, 0.05), 0.0025),
+        ('<polyline points="0 0 100 0 100 50"/>', (0.1, 0.05), 0.0025),
+        ('<path d="M20 50A30 30 0 1 1 80 50A30 30 0 1 1 20 50"/>', (0.06, 0.06), np.pi * 9e-4),
+        ('<rect width="100" height="40" transform="rotate(90)"/>', (0.04, 0.1), 0.004),
+        ('<rect width="100" height="40" transform="scale(.5 1) skewX(0)"/>', (0.05, 0.04), 2e-3),
+        ('<rect width="40" height="40" transform="skewX(45)"/>', (0.08, 0.04), 0.0016),
+        ('<rect width="40" height="40" transform="skewY(45)"/>', (0.04, 0.08), 0.0016),
+        ('<rect width="40" height="40" transform="matrix(0 2 1 0 5 5)"/>', (0.04, 0.08), 0.0032),
+        ('<g transform="scale(2)"><g transform="scale(2)"><circle r="5"/></g></g>', (0.04, 0.04),
+         np.pi * 4e-4),
+        ('<rect width="1cm" height="10px"/>', (0.0377953, 0.01), None),
+    ],
+)  # fmt: skip
+def test_shapes_have_their_size_and_area(tmp_path, body, size, area):
+    outline = single(tmp_path, body)
+    assert outline.size == pytest.approx(size, rel=1e-3)
+    if area is not None:
+        assert outline.area == pytest.approx(area, rel=2e-3)
+
+
+def test_rotation_about_a_point_turns_about_it(tmp_path):
+    path = drawing(
+        tmp_path,
+        '<rect id="a" x="10" y="10" width="80" height="20"/>'
+        '<rect id="b" x="10" y="10" width="80" height="20" transform="rotate(180 50 20)"/>',
+    )
+    found = load_svg(path)
+    first, second = found["a"].vertices, found["b"].vertices
+    assert {tuple(p.round(9) + 0.0) for p in first} == {tuple(p.round(9) + 0.0) for p in second}
+
+
+def test_holes_are_left_out(tmp_path):
+    body = '<path d="M20 10H40V30H20Z M0 0H100V50H0Z M60 10H80V30H60Z"/>'
+    assert single(tmp_path, body).area == pytest.approx(0.005)
+
+
+def test_several_shapes_get_their_ids_or_numbers(tmp_path):
+    body = '<circle id="coin" r="12"/><circle r="13"/><circle id="coin" r="14"/>'
+    assert list(load_svg(drawing(tmp_path, body))) == ["coin", "part-2", "coin-3"]
+
+
+def test_what_is_not_drawn_is_left_out(tmp_path):
+    body = (
+        '<defs><circle id="no" r="5"/></defs><circle style="display: none" r="5"/>'
+        '<g display="none"><circle r="5"/></g><text>hello</text><!-- note --><circle r="12"/>'
+    )
+    assert list(load_svg(drawing(tmp_path, body))) == ["part"]
+
+
+@pytest.mark.parametrize(
+    ("root", "unit", "width"),
+    [
+        ('width="100mm" height="100mm" viewBox="0 0 100 100"', None, 0.05),
+        ('width="10cm" height="10cm" viewBox="0 0 500 500"', None, 0.01),
+        ('width="2in" height="2in"', None, 50 * 0.0254 / 96),
+        ('width="200mm" height="100mm" viewBox="0 0 100 100"', None, 0.05),
+        (
+            'width="200mm" height="100mm" viewBox="0 0 100 100" preserveAspectRatio="none"',
+            None,
+            0.1,
+        ),
+        ('width="100" height="100"', "mm", 0.05),
+        ("", "cm", 0.5),
+        ('width="100mm" height="100mm" viewBox="0 0 1 1"', "px", 50 * 0.0254 / 96),
+    ],
+)
+def test_the_unit_comes_from_the_caller_or_from_the_root(tmp_path, root, unit, width):
+    outline = single(tmp_path, '<rect width="50" height="50"/>', root, unit=unit)
+    assert outline.size[0] == pytest.approx(width)
+
+
+@pytest.mark.parametrize(
+    ("body", "root", "expected"),
+    [
+        ('<circle r="5"/>', 'width="100" height="100"', "no physical unit"),
+        ('<circle r="5"/>', 'width="100px" height="100px"', "--unit mm"),
+        ('<circle r="5"/>', "", "no physical unit"),
+        ('<circle r="5"/>', 'width="9mm" height="9mm" viewBox="0 0 9"', "viewBox '0 0 9'"),
+        ("<text>only words</text>", MM, "holds no shapes"),
+        ('<path id="p" d="M0 0L5 X"/>', MM, "<path id='p'>: path data lacks a number"),
+        ('<path d="M0 0H50V50Z M60 0H80V20Z"/>', MM, "several separate pieces"),
+        ('<path d="M0 0L50 50H0L50 0Z"/>', MM, "crosses or touches itself"),
+        ('<path d="M0 0L50 50"/>', MM, "2 distinct vertices"),
+        ('<polygon points="0 0 1 1"/>', MM, "'points' holds 4 numbers"),
+        ('<use href="#a"/>', MM, "clone"),
+        ('<circle r="half"/>', MM, "r='half' is no length"),
+        ('<circle r="5" transform="wobble(3)"/>', MM, "transform 'wobble'"),
+        ('<circle r="5" transform="scale 3"/>', MM, "is malformed"),
+        ('<circle r="0.5"/>', MM, "expected 0.005 to 1 m"),
+    ],
+)
+def test_a_bad_drawing_is_refused_with_its_cause(tmp_path, body, root, expected):
+    assert expected in refusal(drawing(tmp_path, body, root))
+
+
+@pytest.mark.parametrize("text", ["", "not xml", "<svg><circle></svg>"])
+def test_what_is_not_xml_is_refused(tmp_path, text):
+    path = tmp_path / "bad.svg"
+    path.write_text(text)
+    assert "not readable as SVG" in refusal(path)
+
+
+def test_xml_of_another_kind_is_refused(tmp_path):
+    path = tmp_path / "page.svg"
+    path.write_text("<html/>")
+    assert "its root element is <html>" in refusal(path)
+
+
+def test_an_unknown_unit_is_refused(tmp_path):
+    assert "unit 'pound' is unknown" in refusal(drawing(tmp_path, '<circle r="5"/>'), unit="pound")

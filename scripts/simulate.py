@@ -79,8 +79,6 @@ class Simulation:
         for name in ("steps", "episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
-        if len(self.start) not in (0, 3):
-            raise ValueError(f"start has {len(self.start)} numbers, expected x z phi")
 
 
 def simulate(config: Simulation) -> None:
@@ -90,6 +88,7 @@ def simulate(config: Simulation) -> None:
 
     from tpcd.data.episode import write_together
     from tpcd.parameters import SCENE_NAMES
+    from tpcd.results import to_plain, versions
     from tpcd.truth.recording import make_motion, record, recording_contents
     from tpcd.truth.scene import draw_scene, make_truth
 
@@ -114,6 +113,7 @@ def simulate(config: Simulation) -> None:
     truth = make_truth(scene, config.truth)
     name = config.name or config.policy
     notes = f"simulated, truth {config.truth}, motion {config.policy}, seed {config.seed}"
+    made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
     contents, lines = {}, []
     for episode in range(config.episodes):
         stem = config.out / (name if config.episodes == 1 else f"{name}_{episode}")
@@ -122,7 +122,7 @@ def simulate(config: Simulation) -> None:
         )
         motion = make_motion(config.policy, scene, config.steps, generator)
         recording = record(truth, scene, motion, config.steps, generator, sensor_std, notes=notes)
-        contents.update(recording_contents(recording, scene, stem, config.format))
+        contents.update(recording_contents(recording, scene, stem, config.format, made_by))
         reach = [scene.clearances(pose) for pose in recording.true.poses[1:]]
         lines.append(
             f"{stem}.{config.format}: {config.steps} steps,"
@@ -142,7 +142,7 @@ def find_outline(name: str) -> Outline:
     from tpcd.shape.sources import load_outlines
     from tpcd.shape.ycb import load_ycb, ycb_folder
 
-    if Path(name).suffix and not name.startswith("0"):
+    if Path(name).suffix:
         outlines = load_outlines(name)
         if len(outlines) != 1:
             raise ValueError(

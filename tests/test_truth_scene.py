@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from tpcd.data import check_episode, read_episode
 from tpcd.errors import EpisodeError
@@ -263,6 +264,8 @@ def test_the_command_makes_several_episodes_of_one_scene(simulate_command, tmp_p
     assert first[1].theta == second[1].theta
     assert first[1].friction == 0.4
     assert not torch.equal(first[0].commands, second[0].commands)
+    made_by = yaml.safe_load((tmp_path / "a" / "test_0.truth.yaml").read_text())["made_by"]
+    assert made_by["config"]["friction"] == 0.4 and "packages" in made_by
     before = {path: path.read_bytes() for path in (tmp_path / "a").iterdir()}
     code = simulate_command(
         "--outline", "mug", "--policy", "test", "--steps", "4", "--seed", "3", "--episodes", "3",
@@ -295,7 +298,7 @@ def test_both_truths_answer_the_same_first_steps_alike(simulate_command, tmp_pat
         (("--outline", "none.csv"), "none.csv"),
         (("--outline", "mug", "--steps", "0"), "steps is 0"),
         (("--outline", "mug", "--start", "0", "0", "0"), "inside the floor"),
-        (("--outline", "mug", "--start", "0", "0"), "expected x z phi"),
+        (("--outline", "mug", "--start", "0", "0"), "expected x, z, phi"),
         (("--outline", "mug", "--noise-force", "-1"), "sensor_std"),
     ],
 )

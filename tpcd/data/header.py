@@ -34,8 +34,8 @@ LARGEST_LENGTH = 5.0
 class Header:
     """What the YAML of an episode says, in SI units."""
 
-    stiffness: tuple[float, float, float]
-    sensor_std: tuple[float, float, float, float, float, float]
+    stiffness: tuple[float, ...]
+    sensor_std: tuple[float, ...]
     object: str | None
     notes: str | None
     time_step_s: float | None
@@ -91,8 +91,8 @@ def parse_header(content: Any, path: Path) -> Header:
         if time_step <= 0:
             raise EpisodeError(path, f"time_step_s is {time_step:g}, expected > 0", "give seconds")
     return Header(
-        stiffness=tuple(stiffness),  # type: ignore[arg-type]
-        sensor_std=tuple(sensor_std),  # type: ignore[arg-type]
+        stiffness=tuple(stiffness),
+        sensor_std=tuple(sensor_std),
         object=_text(path, "object", content.get("object")),
         notes=_text(path, "notes", content.get("notes")),
         time_step_s=time_step,

@@ -7,10 +7,10 @@ theta, the outline and which steps settled.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import yaml
@@ -141,15 +141,20 @@ def recording_contents(
     scene: Scene,
     path: str | Path,
     format: Literal["csv", "parquet"] = "csv",
+    made_by: Mapping[str, Any] | None = None,
 ) -> dict[Path, bytes | None]:
-    """What the files of an episode and of its truth hold, for `write_together`."""
+    """What the files of an episode and of its truth hold, for `write_together`.
+
+    `made_by` says how they came about (configuration, versions) in plain values and goes
+    into NAME.truth.yaml.
+    """
     contents = episode_contents(recording.measured, path, format)
     header_path = list(contents)[1]
     stem = str(header_path).removesuffix(".yaml")
     true_contents = episode_contents(recording.true, f"{stem}.truth.csv")
     true_table_path = next(iter(true_contents))
     contents[true_table_path] = true_contents[true_table_path]
-    content = {
+    content: dict[str, Any] = {
         "theta": scene.theta,
         "outline": {
             "name": scene.outline_name,
@@ -159,6 +164,8 @@ def recording_contents(
         "stiffness": scene.stiffness.tolist(),
         "not_settled": [step for step, still in enumerate(recording.settled) if not still],
     }
+    if made_by:
+        content["made_by"] = dict(made_by)
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
     contents[Path(f"{stem}.truth.yaml")] = text.encode("utf-8")
     return contents

@@ -80,8 +80,8 @@ def draw_scene(
     generator: torch.Generator,
     fixed: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    stiffness: tuple[float, float, float] = DEFAULT_STIFFNESS,
-    start_pose: tuple[float, float, float] | None = None,
+    stiffness: tuple[float, ...] = DEFAULT_STIFFNESS,
+    start_pose: tuple[float, ...] | None = None,
 ) -> Scene:
     """Draw theta from uniform priors and choose a free start pose.
 
@@ -105,6 +105,8 @@ def draw_scene(
         raise ValueError(
             f"scale is {theta['scale']}, friction {theta['friction']}; expected > 0 and >= 0"
         )
+    if start_pose is not None and len(start_pose) != 3:
+        raise ValueError(f"start pose has {len(start_pose)} numbers, expected x, z, phi")
     vertices = torch.tensor(np.asarray(outline_vertices), dtype=torch.float64)
     mount = torch.tensor(
         [theta["mount_x"], theta["mount_z"], theta["mount_phi"]], dtype=torch.float64

@@ -1,0 +1,15 @@
+"""The belief over theta: likelihood, resampling, samplers, and the paper's filter."""
+
+from tpcd.belief.belief import Belief, EstimationStep, EstimatorSettings, estimate
+from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.belief.smc import SamplerSettings
+
+__all__ = [
+    "Belief",
+    "EstimationStep",
+    "EstimatorSettings",
+    "ParameterPrior",
+    "SamplerSettings",
+    "estimate",
+    "make_prior",
+]

@@ -1,0 +1,89 @@
+"""What has been measured so far, in the form the likelihood wants.
+
+A settled row carries the pose twice: measured directly, and through the wrench, since
+w = K (x' - u). The two are merged into one estimate of the settled pose with diagonal
+covariance (inverse-variance weights). What they disagree about, the parity residual
+w - K (x - u), holds no information on theta but tells a bad reading from a good one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.data.episode import Episode
+from tpcd.planar import wrap_angle
+
+PARITY_LIMIT = 16.3
+"""Parity chi-square (3 degrees of freedom) beyond which a reading counts as bad: 0.1 %."""
+
+
+@dataclass(frozen=True)
+class History:
+    """n transitions: start pose measured, command, settled pose estimated.
+
+    Poses and commands (x, z, angle) [m, m, rad]; variances in their squares.
+    """
+
+    start: Float[Tensor, "n 3"]
+    start_variance: Float[Tensor, "n 3"]
+    command: Float[Tensor, "n 3"]
+    settled: Float[Tensor, "n 3"]
+    settled_variance: Float[Tensor, "n 3"]
+    stiffness: Float[Tensor, " 3"]
+
+    def __len__(self) -> int:
+        """Number of transitions."""
+        return len(self.start)
+
+    def first(self, count: int) -> History:
+        """The first transitions only."""
+        return History(
+            self.start[:count],
+            self.start_variance[:count],
+            self.command[:count],
+            self.settled[:count],
+            self.settled_variance[:count],
+            self.stiffness,
+        )
+
+
+def history_of(episode: Episode, least_std: float = 2e-5) -> History:
+    """The transitions of an episode: row k explains how row k - 1 went over to it.
+
+    `least_std` [m, m, rad] is added to the noise of poses, in quadrature: what the numerics
+    of any simulator leave.
+    """
+    stiffness = episode.stiffness.double()
+    poses, commands = episode.poses.double(), episode.commands.double()
+    variance = episode.sensor_std.double() ** 2 + least_std**2
+    pose_variance = variance[:3]
+    wrench_variance = variance[3:] / stiffness**2
+    offset = episode.wrenches.double() / stiffness + commands - poses
+    offset = torch.cat((offset[:, :2], wrap_angle(offset[:, 2:])), dim=-1)
+    weight = pose_variance / (pose_variance + wrench_variance)
+    settled = poses + weight * offset
+    merged = (weight * wrench_variance).expand_as(poses)
+    parity = (offset**2 / (pose_variance + wrench_variance)).sum(-1, keepdim=True)
+    # Either sensor may be at fault; a bad row is kept with a variance that covers both.
+    bad = torch.where(parity > PARITY_LIMIT, offset**2, 0.0)
+    return History(
+        start=poses[:-1],
+        start_variance=(pose_variance + bad)[:-1],
+        command=commands[1:],
+        settled=settled[1:],
+        settled_variance=(merged + bad)[1:],
+        stiffness=stiffness,
+    )
+
+
+def parity_chi_square(episode: Episode) -> Float[Tensor, " n"]:
+    """Chi-square (3 degrees of freedom) of w - K (x - u) for each row."""
+    stiffness = episode.stiffness
+    variance = (episode.sensor_std.double() ** 2).clamp_min(1e-18)
+    offset = episode.wrenches / stiffness + episode.commands - episode.poses
+    offset = torch.cat((offset[:, :2], wrap_angle(offset[:, 2:])), dim=-1)
+    return (offset**2 / (variance[:3] + variance[3:] / stiffness**2)).sum(-1)

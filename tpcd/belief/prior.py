@@ -1,0 +1,112 @@
+"""The prior over theta and the unconstrained coordinates in which samplers move.
+
+Every entry of theta lives in a box [low, high]. The coordinate y of an entry is the normal
+score of its place in the box, theta = low + (high - low) Phi(y), so that moves never meet a
+wall and a uniform prior becomes a standard normal one. The shape latent has the box
+[-1, 1] and, on top, the density fitted with the shape model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.parameters import (
+    DEFAULT_BOUNDS,
+    SCENE_NAMES,
+    Parameters,
+    parameter_names,
+    parameter_units,
+)
+from tpcd.shape.protocol import Shape
+
+_EDGE = 1e-9
+"""Closest a place in the box comes to its ends, relative to its width."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterPrior:
+    """Independent uniform priors on the scene entries and the shape model's latent density."""
+
+    shape: Shape
+    low: Float[Tensor, " d"]
+    high: Float[Tensor, " d"]
+
+    @property
+    def dimension(self) -> int:
+        """Number of entries d of theta."""
+        return len(self.low)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of theta."""
+        return parameter_names(self.shape.latent_dim)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the entries of theta."""
+        return parameter_units(self.shape.latent_dim)
+
+    def to_vector(self, score: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        """Theta in SI units from unconstrained coordinates."""
+        place = torch.special.ndtr(score).clamp(_EDGE, 1 - _EDGE)
+        return self.low + (self.high - self.low) * place
+
+    def to_parameters(self, score: Float[Tensor, "*batch d"]) -> Parameters:
+        """Theta as named tensors from unconstrained coordinates."""
+        return Parameters.from_vector(self.to_vector(score))
+
+    def to_score(self, vector: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        """Unconstrained coordinates of theta; entries outside their box land on its edge."""
+        place = ((vector - self.low) / (self.high - self.low)).clamp(_EDGE, 1 - _EDGE)
+        return torch.special.ndtri(place)
+
+    def log_density(self, score: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch"]:
+        """Log prior density in the unconstrained coordinates; -inf at an invalid shape."""
+        normal = -0.5 * (score**2).sum(-1) - 0.5 * self.dimension * math.log(2 * math.pi)
+        z = self.shape.latent_dim
+        if z == 0:
+            return normal
+        # The box of the latent has the uniform density 2^-z, which the normal score includes.
+        latent = self.to_vector(score)[..., :z]
+        return normal + self.shape.log_density(latent) + z * math.log(2.0)
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count d"]:
+        """Draw unconstrained coordinates from the prior."""
+        score = torch.randn(count, self.dimension, generator=generator, dtype=torch.float64)
+        z = self.shape.latent_dim
+        if z == 0:
+            return score
+        latent = self.shape.sample_latent(count, generator).double()
+        place = ((latent + 1) / 2).clamp(_EDGE, 1 - _EDGE)
+        return torch.cat((torch.special.ndtri(place), score[:, z:]), dim=-1)
+
+
+def make_prior(
+    shape: Shape, bounds: Mapping[str, tuple[float, float]] | None = None
+) -> ParameterPrior:
+    """The prior with the default bounds, replaced where `bounds` names an entry [SI units].
+
+    Raises ValueError for a name that is not a scene entry or bounds without width.
+    """
+    given = dict(bounds or {})
+    unknown = sorted(set(given) - set(SCENE_NAMES))
+    if unknown:
+        raise ValueError(f"no parameter {unknown[0]!r}; expected one of {', '.join(SCENE_NAMES)}")
+    low, high = [-1.0] * shape.latent_dim, [1.0] * shape.latent_dim
+    for name in SCENE_NAMES:
+        lower, upper = given.get(name, DEFAULT_BOUNDS[name])
+        if not lower < upper:
+            raise ValueError(f"prior of {name} is [{lower}, {upper}], expected low < high")
+        low.append(lower)
+        high.append(upper)
+    return ParameterPrior(
+        shape=shape,
+        low=torch.tensor(low, dtype=torch.float64),
+        high=torch.tensor(high, dtype=torch.float64),
+    )

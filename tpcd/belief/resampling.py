@@ -1,0 +1,50 @@
+"""Resampling and weights of particles, in float64 and in the log domain."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def normalise_log_weights(log_weights: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+    """Weights that sum to 1. Raises ValueError where every weight is zero or one is NaN."""
+    largest = log_weights.double().max()
+    if not bool(torch.isfinite(largest)):
+        raise ValueError(
+            f"the largest log weight is {float(largest)}, expected a finite number: no particle "
+            "explains the data, or a likelihood is NaN"
+        )
+    weights = torch.exp(log_weights.double() - largest)
+    return weights / weights.sum()
+
+
+def effective_sample_size(weights: Float[Tensor, " m"]) -> float:
+    """Kish's number 1 / sum w^2 for weights that sum to 1 (Kong, Liu and Wong 1994)."""
+    return float(1.0 / (weights.double() ** 2).sum())
+
+
+def systematic_resample(
+    weights: Float[Tensor, " m"], count: int, generator: torch.Generator
+) -> Int[Tensor, " count"]:
+    """Draw `count` ancestors with one uniform number (Kitagawa 1996), least variance of all.
+
+    Ancestor i appears floor(count w_i) or ceil(count w_i) times, never with zero weight.
+    """
+    cumulative = weights.double().cumsum(0)
+    start = torch.rand((), generator=generator, dtype=torch.float64)
+    positions = (torch.arange(count, dtype=torch.float64) + start) / count * cumulative[-1]
+    index = torch.searchsorted(cumulative, positions.to(cumulative.device), right=True)
+    last = int(torch.nonzero(weights > 0).max())
+    return index.clamp(max=last)
+
+
+def multinomial_resample(
+    weights: Float[Tensor, " m"], count: int, generator: torch.Generator
+) -> Int[Tensor, " count"]:
+    """Draw `count` independent ancestors."""
+    cumulative = weights.double().cumsum(0)
+    positions = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]
+    index = torch.searchsorted(cumulative, positions.to(cumulative.device), right=True)
+    last = int(torch.nonzero(weights > 0).max())
+    return index.clamp(max=last)

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.ply import export_ply
 
 from tpcd.errors import FileError
 from tpcd.shape.download import UPLOAD_PART, Patience, download
@@ -250,7 +251,7 @@ def archive(members: dict[str, bytes], **attributes) -> bytes:
 
 def crate() -> bytes:
     mesh = trimesh.creation.box(extents=(0.06, 0.16, 0.21))
-    return trimesh.exchange.ply.export_ply(mesh)
+    return export_ply(mesh)
 
 
 def member(name: str = NAME) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
+from numpy.typing import ArrayLike
 
 from tpcd.errors import OutlineError
 from tpcd.shape.section import (
@@ -21,7 +22,7 @@ UP = np.array([0.0, 0.0, 1.0])
 FRONT = np.array([0.0, -1.0, 0.0])
 
 
-def plane(origin=(0.0, 0.0, 0.0), normal=FRONT, up=UP) -> CuttingPlane:
+def plane(origin: ArrayLike = (0.0, 0.0, 0.0), normal: ArrayLike = FRONT, up=UP) -> CuttingPlane:
     return CuttingPlane(np.array(origin, dtype=float), np.array(normal, dtype=float), up)
 
 
@@ -189,7 +190,7 @@ def test_meshes_of_every_kind_load_in_their_unit(tmp_path, ending, unit, factor)
 def test_the_plane_can_be_chosen_when_loading(tmp_path):
     path = tmp_path / "crate.ply"
     box(0.1, 0.04, 0.2).export(path)
-    found = load_outlines(path, plane=plane(normal=[1.0, 0.0, 0.0]))
+    found = load_outlines(path, plane=plane(normal=(1.0, 0.0, 0.0)))
     assert found["crate"].size == pytest.approx((0.04, 0.2), rel=1e-6)
 
 

@@ -114,7 +114,8 @@ def test_flattened_curves_keep_the_tolerance():
     (curve,) = parse_path("M0 0C0 100 100 100 100 0")
     t = np.linspace(0, 1, 2001)[:, None]
     control = curve[0]
-    true = sum(c * t**k * (1 - t) ** (3 - k) * control[k] for k, c in enumerate((1, 3, 3, 1)))
+    weights = np.hstack([c * t**k * (1 - t) ** (3 - k) for k, c in enumerate((1, 3, 3, 1))])
+    true = weights @ control
     for tolerance in (1.0, 0.1, 0.01):
         points = np.vstack((flatten(curve[:1], tolerance), control[-1:]))
         start, step = points[:-1], np.diff(points, axis=0)

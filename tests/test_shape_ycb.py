@@ -97,6 +97,7 @@ def test_all_ycb_outlines_load_and_hold_the_selection():
 @needs_ycb
 @pytest.mark.parametrize("name", WELL_CUT)
 def test_cutting_a_ycb_mesh_in_its_published_plane_gives_the_published_outline(name):
+    assert FOLDER is not None
     with (FOLDER / "slices.csv").open() as stream:
         row = next(row for row in csv.DictReader(stream) if row["object"] == name)
     origin, u, w = (np.array([float(row[f"{key}_{axis}"]) for axis in "xyz"])

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from shapely.geometry import Polygon
 
 from tpcd.errors import OutlineError
@@ -301,7 +302,7 @@ def make_entry(name: str, entry: Entry) -> Outline:
     """
     sharp = entry.maker(**entry.dimensions)
     smooth = rounded(sharp, entry.edge).simplify(CURVE_TOLERANCE)
-    vertices = np.asarray(smooth.exterior.coords)[:-1] / 1000.0
+    vertices = shapely.get_coordinates(smooth)[:-1] / 1000.0
     return make_outline(name, vertices, source=entry.source, notes="made in code")
 
 

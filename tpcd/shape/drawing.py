@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from shapely import affinity
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
 
 Number = float | int
 """A coordinate or length [mm]."""
@@ -42,7 +43,8 @@ def rounded(shape: Polygon, radius: Number) -> Polygon:
     raise ValueError("the shape has parts too thin to round")
 
 
-def union(*parts: Polygon) -> Polygon:
+def union(*parts: BaseGeometry) -> Polygon:
+    """Parts that touch or overlap, as one; `ValueError` where they do not hang together."""
     joined = shapely.union_all(list(parts))
     if not isinstance(joined, Polygon):
         raise ValueError("the parts do not hang together")
@@ -56,10 +58,12 @@ def filleted(shape: Polygon, radius: Number) -> Polygon:
 
 
 def rectangle(left: Number, bottom: Number, right: Number, top: Number) -> Polygon:
+    """A rectangle with sides along the axes."""
     return shapely.box(left, bottom, right, top)
 
 
 def oval(x: Number, z: Number, width: Number, height: Number) -> Polygon:
+    """An ellipse about (x, z) with axes along x and z."""
     circle = shapely.Point(0, 0).buffer(0.5, quad_segs=ARC_SEGMENTS)
     return affinity.translate(affinity.scale(circle, width, height, origin=(0, 0)), x, z)
 
@@ -79,7 +83,8 @@ def eased(
     return list(zip(radius.tolist(), (low + share * (high - low)).tolist(), strict=True))
 
 
-def outer(shape: Polygon | MultiPolygon) -> Polygon:
+def outer(shape: BaseGeometry) -> Polygon:
+    """The shape without its holes; `ValueError` where it is not one piece."""
     if not isinstance(shape, Polygon) or shape.is_empty:
         raise ValueError("the shape is not one piece")
     return Polygon(shape.exterior)

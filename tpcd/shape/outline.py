@@ -127,8 +127,8 @@ def hull(outline: Outline) -> Float64[np.ndarray, "h 2"]:
 
     A half-plane touches an outline only at these.
     """
-    ring = outline.polygon.convex_hull.exterior
-    points = np.asarray(ring.coords)[:-1]
+    ring = shapely.get_exterior_ring(shapely.convex_hull(outline.polygon))
+    points = shapely.get_coordinates(ring)[:-1]
     return points if shapely.is_ccw(ring) else points[::-1].copy()
 
 

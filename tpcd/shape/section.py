@@ -77,9 +77,7 @@ def load_mesh(path: str | Path, *, unit: str = "m") -> trimesh.Trimesh:
     if not path.is_file():
         raise OutlineError(path, "not found", "give a mesh file")
     try:
-        mesh = trimesh.load(
-            path, file_type=path.suffix[1:].lower(), force="mesh", skip_materials=True
-        )
+        mesh = trimesh.load_mesh(path, file_type=path.suffix[1:].lower(), skip_materials=True)
         faces = len(mesh.faces)
     except Exception as error:  # the readers of trimesh raise whatever they stumble over
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -102,12 +100,14 @@ def upright_plane(
     cut through its handle).
     """
     above = shapely.MultiPoint(np.asarray(mesh.vertices)[:, :2]).convex_hull
+    if not isinstance(above, shapely.Polygon):
+        raise ValueError("the mesh is flat seen from above; give a plane")
     if along == "rectangle":
-        corners = np.asarray(shapely.minimum_rotated_rectangle(above).exterior.coords)[:3]
+        corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(above))[:3]
         sides = np.diff(corners, axis=0)
         direction = sides[np.linalg.norm(sides, axis=1).argmax()]
     elif along == "longest":
-        rim = np.asarray(above.exterior.coords)[:-1]
+        rim = shapely.get_coordinates(above)[:-1]
         spans = rim[:, None] - rim[None]
         first, second = np.unravel_index((spans**2).sum(-1).argmax(), spans.shape[:2])
         direction = spans[first, second]
@@ -209,7 +209,7 @@ def _loops(mesh: trimesh.Trimesh, plane: CuttingPlane, blame: str | Path) -> lis
         touched = True
         flat = np.round((pieces - plane.origin) @ np.stack((across, up), axis=1) / GRID) * GRID
         flat = flat[(flat[:, 0] != flat[:, 1]).any(axis=1)]
-        merged = shapely.line_merge(shapely.multilinestrings(shapely.linestrings(flat)))
+        merged = shapely.line_merge(shapely.MultiLineString(list(flat)))
         lines = list(getattr(merged, "geoms", [merged]))
         if lines and all(line.is_closed for line in lines):
             rings = [line for line in lines if len(line.coords) > 3]
@@ -242,8 +242,8 @@ def _check_uncrossed(rings: list[shapely.LineString], blame: str | Path) -> None
 
 def _recesses_closed(polygon: shapely.Polygon, steepest: float = 15.0) -> shapely.Polygon:
     """Fill pockets behind those edges of the convex hull that face up or down [degrees]."""
-    points = np.asarray(shapely.Polygon(polygon.exterior).normalize().exterior.coords)[:-1]
-    on_hull = {tuple(p) for p in np.asarray(polygon.convex_hull.exterior.coords)}
+    points = shapely.get_coordinates(polygon.exterior)[:-1]
+    on_hull = {tuple(p) for p in shapely.get_coordinates(polygon.convex_hull)}
     stops = [index for index, point in enumerate(points) if tuple(point) in on_hull]
     pockets = []
     for first, last in zip(stops, stops[1:] + stops[:1], strict=True):

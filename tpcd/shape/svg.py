@@ -89,8 +89,11 @@ def _outer_loop(path: Path, name: str, loops: list[np.ndarray]) -> np.ndarray:
     if not polygons:
         return loops[0]
     largest = max(polygons, key=lambda polygon: polygon.area)
+    reach = largest.buffer(1e-9)
     for other in polygons:
-        if other is not largest and not largest.buffer(1e-9).contains(other):
+        if other is not largest and not reach.covers(
+            shapely.MultiPoint(list(other.exterior.coords))
+        ):
             raise OutlineError(
                 path, f"'{name}' has several separate pieces", "draw each as a path of its own"
             )

@@ -140,7 +140,7 @@ def _commands(text: str) -> list[tuple[str, list[float]]]:
     position = _skip(text, 0)
     found: list[tuple[str, list[float]]] = []
     while position < len(text):
-        letter = text[position]
+        letter: str = text[position]
         if letter.upper() not in ARGUMENTS or (not found and letter not in "Mm"):
             raise ValueError(f"path data has {letter!r} at character {position + 1}")
         position = _skip(text, position + 1)
@@ -158,7 +158,7 @@ def _commands(text: str) -> list[tuple[str, list[float]]]:
                 position = _skip(text, match.end())
             found.append((letter, values))
             # Pairs that follow a move are lines (SVG 2, 9.3.3).
-            letter = {"M": "L", "m": "l"}.get(letter, letter)
+            letter = "L" if letter == "M" else "l" if letter == "m" else letter
             if count == 0 or not NUMBER.match(text, position):
                 break
     return found

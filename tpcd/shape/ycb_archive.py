@@ -272,7 +272,7 @@ def _views(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def _thinned(vertices: np.ndarray) -> np.ndarray:
     import shapely
 
-    return np.asarray(shapely.Polygon(vertices).simplify(SIMPLIFY).exterior.coords)[:-1]
+    return shapely.get_coordinates(shapely.Polygon(vertices).simplify(SIMPLIFY))[:-1]
 
 
 def _write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from tpcd.shape.outline import Outline, hull, points_at, resample_positions
 
-CHUNK = 1 << 20
-"""Point-edge pairs looked at together; bounds the memory of `signed_distance`."""
+CHUNK = 1 << 16
+"""Point-edge pairs looked at together; few enough to stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +123,13 @@ def _fraction_along(points: Tensor, starts: Tensor, edges: Tensor) -> Tensor:
 def _nearest_edge(points: Tensor, vertices: Tensor, edges: Tensor) -> Tensor:
     """Index of the edge nearest to each point (first of equals), without autograd."""
     found = []
+    (edge_x, edge_z), squares = edges.unbind(-1), (edges * edges).sum(-1)
+    unit_x, unit_z = edge_x / squares, edge_z / squares
     for chunk in points.split(max(1, CHUNK // len(vertices))):
-        offset = chunk[:, None] - vertices
-        along = ((offset * edges).sum(-1) / (edges * edges).sum(-1)).clamp(0, 1)
-        gap = offset - along[..., None] * edges
-        found.append((gap * gap).sum(-1).argmin(-1))
+        x = chunk[:, :1] - vertices[:, 0]
+        z = chunk[:, 1:] - vertices[:, 1]
+        along = (x * unit_x).addcmul_(z, unit_z).clamp_(0, 1)
+        x.addcmul_(along, edge_x, value=-1)
+        z.addcmul_(along, edge_z, value=-1)
+        found.append(x.square_().addcmul_(z, z).argmin(-1))
     return torch.cat(found) if found else torch.zeros(0, dtype=torch.long, device=points.device)

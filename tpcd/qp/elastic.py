@@ -32,7 +32,7 @@ def elastic_compliance(
     hessian: Float[Tensor, "*#batch n n"], rows: Float[Tensor, "*batch m n"]
 ) -> Float[Tensor, "*batch m"]:
     """The compliance c = RELAXATION * a^T H^-1 a of each row; of zero rows, RELAXATION."""
-    factor = torch.linalg.cholesky(hessian)
+    factor = torch.linalg.cholesky(0.5 * (hessian + hessian.mT))
     whitened = torch.linalg.solve_triangular(factor, rows.mT, upper=False)
     square = whitened.square().sum(-2)
     return RELAXATION * torch.where(square > 0, square, 1.0)

@@ -17,7 +17,7 @@ from torch import Tensor
 from tpcd.errors import SolverError
 from tpcd.qp.compiled import solve_rows
 from tpcd.qp.problem import ContactQP, QPSolution, Status
-from tpcd.qp.whitening import PIVOT_TOLERANCE, shared_hessian
+from tpcd.qp.whitening import ASYMMETRY_TOLERANCE, PIVOT_TOLERANCE, shared_hessian
 
 _INFEASIBLE = int(Status.INFEASIBLE)
 _INVALID = int(Status.INVALID_INPUT)
@@ -43,7 +43,6 @@ def solve_native(problem: ContactQP, iteration_limit: int | None = None) -> QPSo
     )
     arguments = (
         _array(hessian, -1, n, n),
-        torch.finfo(dtype).eps ** 0.5,
         _array(problem.target, count, n),
         _array(problem.rows, count, m, n),
         _array(problem.offsets, count, m),
@@ -80,9 +79,7 @@ def _mask(problem: ContactQP, count: int, m: int) -> np.ndarray:
 
 @njit(inline="always", error_model="numpy")
 @no_type_check
-def _solve_batch(
-    hessian, asymmetry, target, rows, offsets, mask, compliance, limit, n, k, s, yields, answer
-):
+def _solve_batch(hessian, target, rows, offsets, mask, compliance, limit, n, k, s, yields, answer):
     """Whiten, solve and check one element after the other; `answer` is written in place.
 
     k = n, or n + m with compliance (`yields`), whose variables are the last m.
@@ -103,7 +100,7 @@ def _solve_batch(
     definite = False
     for element in range(count):
         if element == 0 or hessian.shape[0] > 1:
-            definite = _factorise(hessian[element], n, asymmetry, factor, inverse)
+            definite = _factorise(hessian[element], n, factor, inverse)
         valid = definite
         for i in range(n):
             valid = valid and np.isfinite(target[element, i])
@@ -189,7 +186,7 @@ def _solve_batch(
 
 @njit(inline="always", error_model="numpy")
 @no_type_check
-def _factorise(hessian, n, asymmetry, factor, inverse):
+def _factorise(hessian, n, factor, inverse):
     """Lower Cholesky factor of the symmetric part and 1 / its diagonal; whether it exists."""
     definite = True
     for i in range(n):
@@ -197,7 +194,7 @@ def _factorise(hessian, n, asymmetry, factor, inverse):
             entry = 0.5 * (hessian[i, j] + hessian[j, i])
             if j < i:
                 size = np.sqrt(abs(hessian[i, i] * hessian[j, j]))
-                if not abs(hessian[i, j] - hessian[j, i]) <= asymmetry * size:
+                if not abs(hessian[i, j] - hessian[j, i]) <= ASYMMETRY_TOLERANCE * size:
                     definite = False
             for k in range(j):
                 entry -= factor[i, k] * factor[j, k]
@@ -214,21 +211,18 @@ def _factorise(hessian, n, asymmetry, factor, inverse):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _solve_batch_3(hessian, asymmetry, target, rows, offsets, mask, limit, answer):
-    _solve_batch(
-        hessian, asymmetry, target, rows, offsets, mask, offsets, limit, 3, 3, 3, False, answer
-    )
+def _solve_batch_3(hessian, target, rows, offsets, mask, limit, answer):
+    _solve_batch(hessian, target, rows, offsets, mask, offsets, limit, 3, 3, 3, False, answer)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _solve_batch_n(hessian, asymmetry, target, rows, offsets, mask, compliance, limit, answer):
+def _solve_batch_n(hessian, target, rows, offsets, mask, compliance, limit, answer):
     n, m = target.shape[1], offsets.shape[1]
     yields = compliance.size > 0
     k = n + m if yields else n
     _solve_batch(
         hessian,
-        asymmetry,
         target,
         rows,
         offsets,

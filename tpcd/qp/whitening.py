@@ -23,6 +23,9 @@ from tpcd.qp.problem import ContactQP
 
 PIVOT_TOLERANCE = 1e-14
 """A pivot below this fraction of its diagonal entry makes the hessian not positive definite."""
+ASYMMETRY_TOLERANCE = 1e-4
+"""Mirrored entries may differ by this times the root of their diagonal entries; the mean is
+used. Loose enough for finite differences in single entries, tight enough for mistakes."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ def whiten(problem: ContactQP) -> WhitenedQP:
             offsets = offsets.where(mask, 1.0)
             compliance = None if compliance is None else compliance.where(mask, 0.0)
         hessian = shared_hessian(problem).permute(1, 2, 0).to(torch.float64)
-        factor, valid = _cholesky(hessian, problem.hessian.dtype)
+        factor, valid = _cholesky(hessian)
         valid = valid.expand(target.shape[-1]).clone()
         valid &= target.isfinite().all(0)
         if compliance is not None:
@@ -143,10 +146,9 @@ def shared_hessian(problem: ContactQP) -> Float[Tensor, "h n n"]:
     return hessian.expand(*problem.batch_shape, n, n).reshape(count, n, n)
 
 
-def _cholesky(hessian: Tensor, dtype: torch.dtype) -> tuple[tuple[tuple[Tensor, ...], ...], Tensor]:
+def _cholesky(hessian: Tensor) -> tuple[tuple[tuple[Tensor, ...], ...], Tensor]:
     """Lower factor of the symmetric part and whether it is one; 1 in place of a bad pivot."""
     n = hessian.shape[0]
-    slack = torch.finfo(dtype).eps ** 0.5
     valid = hessian.isfinite().all(0).all(0)
     factor: list[tuple[Tensor, ...]] = []
     for i in range(n):
@@ -155,7 +157,9 @@ def _cholesky(hessian: Tensor, dtype: torch.dtype) -> tuple[tuple[tuple[Tensor, 
             entry = 0.5 * (hessian[i, j] + hessian[j, i])
             if j < i:
                 size = (hessian[i, i] * hessian[j, j]).abs().sqrt()
-                valid = valid & ((hessian[i, j] - hessian[j, i]).abs() <= slack * size)
+                valid = valid & (
+                    (hessian[i, j] - hessian[j, i]).abs() <= ASYMMETRY_TOLERANCE * size
+                )
             for k in range(j):
                 entry = entry - line[k] * (factor[j][k] if j < i else line[k])
             if j < i:

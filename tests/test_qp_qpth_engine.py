@@ -1,0 +1,83 @@
+"""The optional engine qpth: same call, same statuses, less accuracy, none of it silent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from eval.bench.contact_problems import ContactRecipe, random_contact_problems
+from tpcd.errors import SolverError
+from tpcd.qp import ContactQP, Status, solve
+
+pytest.importorskip("qpth", reason="the extra qpth is not installed")
+
+
+def test_solved_elements_are_close_to_the_exact_answer():
+    problem = random_contact_problems(1500, 8, 0)
+    answer, exact = solve(problem, "qpth"), solve(problem, "exact")
+    assert answer.solved.double().mean() > 0.99
+    force = (answer.motion - exact.motion) @ problem.hessian
+    assert force[answer.solved].abs().max() < 0.02
+    assert force[answer.solved].abs().median() < 1e-6
+
+
+def test_multipliers_carry_the_force():
+    problem = random_contact_problems(300, 8, 1)
+    answer = solve(problem, "qpth")
+    force = (answer.motion - problem.target) @ problem.hessian
+    pushed = (problem.rows * answer.multipliers[..., None]).sum(-2)
+    assert (force - pushed)[answer.solved].abs().max() < 0.02
+    assert answer.multipliers.min() >= 0
+    assert not (answer.multipliers[~answer.active] != 0).any()
+
+
+def test_duplicates_and_padding_are_not_silently_wrong():
+    problem = random_contact_problems(400, 8, 2)
+    twice = ContactQP(
+        problem.hessian,
+        problem.target,
+        problem.rows.repeat(1, 2, 1),
+        problem.offsets.repeat(1, 2),
+        row_mask=problem.row_mask.repeat(1, 2),
+    )
+    answer, exact = solve(twice, "qpth"), solve(problem, "exact")
+    force = (answer.motion - exact.motion) @ problem.hessian
+    assert force[answer.solved].abs().max() < 0.02
+
+
+def test_jammed_problems_are_never_reported_as_solved():
+    jamming = ContactRecipe(friction=(1.1, 1.6), gaps=(-0.003, 0.001), wall_share=0.5)
+    problem = random_contact_problems(400, 8, 3, jamming)
+    jammed = solve(problem, "exact").status == Status.RELAXED
+    answer = solve(problem, "qpth")
+    assert jammed.any() and not (answer.solved & jammed).any()
+
+
+def test_invalid_elements_are_flagged():
+    problem = random_contact_problems(20, 8, 4)
+    target = problem.target.clone()
+    target[3] = torch.nan
+    status = solve(replace(problem, target=target), "qpth").status
+    assert status[3] == Status.INVALID_INPUT
+    assert (status[:3] == Status.SOLVED).all()
+
+
+@pytest.mark.parametrize(("batch", "m"), [((), 4), ((1,), 4), ((2, 3), 2), ((0,), 4), ((3,), 0)])
+def test_every_batch_shape_is_answered_in_kind(batch, m):
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(*batch, m, 3, generator=generator, dtype=torch.float64)
+    target = torch.randn(*batch, 3, generator=generator, dtype=torch.float64)
+    problem = ContactQP(torch.eye(3, dtype=torch.float64), target, rows, rows[..., 0].abs())
+    answer = solve(problem, "qpth")
+    assert answer.motion.shape == (*batch, 3) and answer.multipliers.shape == (*batch, m)
+    expected = solve(problem, "exact").motion
+    torch.testing.assert_close(answer.motion, expected, rtol=0, atol=1e-4)
+
+
+def test_gradients_are_refused_with_the_way_out():
+    problem = random_contact_problems(2, 4, 5)
+    target = problem.target.clone().requires_grad_()
+    with pytest.raises(SolverError, match="use engine='exact'"):
+        solve(replace(problem, target=target), "qpth")

@@ -177,6 +177,15 @@ def test_what_has_no_meaning_is_refused():
         make_truth(torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]).double())
 
 
+def test_instability_is_an_error_and_not_an_answer(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SolverError, match="unstable.*lower the time step"):
+        make_truth().step(vector(0.0, 1e13, 0.0))
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        make_truth().step(vector(math.nan, 0.0, 0.0))
+    assert not list(tmp_path.iterdir())  # MuJoCo's log file
+
+
 def test_without_mujoco_the_error_says_what_to_install(monkeypatch):
     load = builtins.__import__
 

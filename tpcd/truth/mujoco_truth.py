@@ -14,6 +14,8 @@ contact between floor and wall creep.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -52,8 +54,9 @@ class MujocoSettings:
     """MuJoCo's contact impedance d at first touch, d at depth, and that depth [m]. Soft at
     first touch keeps light contact (0.3 N) from chattering; stiff at depth keeps the
     penetration at 5 N near 3 µm, which matters for the torque between floor and wall."""
-    impratio: float = 1e4
-    """Stiffness of friction over that of normal contact; 100 lets jammed contact creep."""
+    impratio: float = 1e3
+    """Stiffness of friction over that of normal contact. 1e2 lets jammed contact creep (5 % of
+    steps do not settle); 1e3 and 1e4 agree to 0.1 mN, but at 1e4 MuJoCo 3 complains."""
     noslip_iterations: int = 10
     """Iterations of the solver that removes slip left by the soft friction; without effect
     at this impratio, needed at lower ones."""
@@ -92,6 +95,8 @@ class MujocoTruth:
         self._data = self._mujoco.MjData(self._model)
         self._isolated = self._mujoco.MjData(self._model)
         self._command = np.zeros(3)
+        kinds = self._mujoco.mjtWarning
+        self._fatal = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
 
     def reset(self, pose: Float[Tensor, " 3"]) -> None:
         """Put the arm at rest at a pose with the command equal to it [m, m, rad]."""
@@ -122,6 +127,20 @@ class MujocoTruth:
         return data.qpos.copy()
 
     def _move(self, data: Any, start: np.ndarray, end: np.ndarray) -> Transition:
+        if not np.isfinite((start, end)).all():
+            raise ValueError(f"command goes from {start} to {end}, expected finite numbers")
+        complaints: list[str] = []
+        with _warnings_to(self._mujoco, complaints.append):
+            settled = self._ramp_and_hold(data, start, end)
+        # On these MuJoCo restarts from zero by itself, which must not pass for an answer.
+        if any(data.warning[kind].number for kind in self._fatal):
+            raise SolverError(f"MuJoCo became unstable ({complaints[-1]}); lower the time step")
+        pose = data.qpos.copy()
+        wrench = self._stiffness * (pose - end)
+        return torch.from_numpy(pose), torch.from_numpy(wrench), settled
+
+    def _ramp_and_hold(self, data: Any, start: np.ndarray, end: np.ndarray) -> bool:
+        """Move the command, then advance until the arm stands still; whether it did."""
         advance, settings = self._mujoco.mj_step, self.settings
         ramp_steps = max(1, round(settings.ramp_time / settings.time_step))
         for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
@@ -129,18 +148,25 @@ class MujocoTruth:
             advance(self._model, data)
         damping = self._stiffness * settings.damping_time
         block = max(1, round(0.05 / settings.time_step))
-        settled = False
         for _ in range(max(1, round(settings.hold_time / settings.time_step / block))):
             before = data.qpos.copy()
             advance(self._model, data, block)
             # The mean speed over the block, so that a chattering contact counts as at rest.
             speed = np.abs(data.qpos - before) / (block * settings.time_step)
             if (damping * speed).max() < settings.settled_force:
-                settled = True
-                break
-        pose = data.qpos.copy()
-        wrench = self._stiffness * (pose - end)
-        return torch.from_numpy(pose), torch.from_numpy(wrench), settled
+                return True
+        return False
+
+
+@contextmanager
+def _warnings_to(mujoco: ModuleType, receive: Callable[[str], None]) -> Iterator[None]:
+    """Keep MuJoCo from writing its warnings to a log file in the working folder."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(receive)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _load_mujoco() -> ModuleType:

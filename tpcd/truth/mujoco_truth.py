@@ -134,7 +134,9 @@ class MujocoTruth:
             settled = self._ramp_and_hold(data, start, end)
         # On these MuJoCo restarts from zero by itself, which must not pass for an answer.
         if any(data.warning[kind].number for kind in self._fatal):
-            raise SolverError(f"MuJoCo became unstable ({complaints[-1]}); lower the time step")
+            raise SolverError(
+                f"MuJoCo became unstable: {complaints[-1]} Check the command or lower the time step"
+            )
         pose = data.qpos.copy()
         wrench = self._stiffness * (pose - end)
         return torch.from_numpy(pose), torch.from_numpy(wrench), settled

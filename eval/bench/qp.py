@@ -1,0 +1,170 @@
+"""Time and check the contact QP engines against each other and against other solvers.
+
+python -m eval.bench.qp --out runs/bench_qp
+python -m eval.bench.qp --device cuda --out runs/bench_qp_cuda
+
+Problems are made like those of the simulator (contact_problems.py): mixed numbers of
+contacts, so that most are padded, with duplicates and flat faces. All solvers run on the
+same problems in one process; on the CPU the seconds are CPU seconds, so that a busy
+machine matters less, and the ratio to qpth is taken within the run.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tpcd.cli import run
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from eval.bench.qp_solvers import Solver
+    from tpcd.qp import ContactQP
+
+QUICK_PROBLEMS = 200
+FORMATS = {
+    "seconds": ".4g",
+    "times_qpth": ".1f",
+    "error_n": ".1e",
+    "solved": ".2%",
+}
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What to time, on how many problems."""
+
+    out: Path = Path("runs/bench_qp")
+    """Folder for results.json and the TensorBoard log."""
+    problems: int = 25_000
+    """Problems of each size."""
+    rows: tuple[int, ...] = (8, 16, 20)
+    """Sizes: rows of a problem, two for each contact."""
+    threads: int = 1
+    """Threads of torch."""
+    device: str = "cpu"
+    """Where the exact engine runs (cpu or cuda); the others run on the CPU only."""
+    wrong_above: float = 1e-6
+    """A claimed solution whose force is off by more than this counts as wrong [N]."""
+    seed: int = 0
+    """Seed of the problems."""
+    quick: bool = False
+    """Few problems, to see that everything works."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no benchmark can be made of."""
+        if self.problems < 1 or self.threads < 1:
+            raise ValueError("problems and threads must be at least 1")
+        if not self.rows or any(rows < 2 or rows % 2 for rows in self.rows):
+            raise ValueError(f"rows is {self.rows}, expected even numbers: two for each contact")
+
+
+def benchmark(config: Benchmark) -> None:
+    """Print seconds, force errors and failures of every contact QP solver that is installed."""
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+
+    from eval.bench.contact_problems import random_contact_problems
+    from eval.bench.qp_solvers import available_solvers, reference_forces
+    from tpcd.errors import SolverError
+    from tpcd.results import format_table, open_run, write_results
+
+    torch.set_num_threads(config.threads)
+    if torch.device(config.device).type == "cuda" and not torch.cuda.is_available():
+        raise SolverError(f"device is {config.device}, but no CUDA device is here; use cpu")
+    folder = open_run(config.out, "python -m eval.bench.qp", config, config.overwrite)
+    count = min(config.problems, QUICK_PROBLEMS) if config.quick else config.problems
+    table: list[dict[str, Any]] = []
+    sources = set()
+    for rows in config.rows:
+        problem = random_contact_problems(count, rows, config.seed)
+        forces, source = reference_forces(problem)
+        sources.add(source)
+        for solver in available_solvers(config.device):
+            print(f"\r{rows} rows: {solver.name:<20}", end="", flush=True)
+            table.append({"rows": rows, **measure(solver, problem, forces, config)})
+        _add_ratios([line for line in table if line["rows"] == rows])
+    print("\r" + " " * 40 + "\r" + format_table(table, formats=FORMATS))
+    clock = "CPU" if torch.device(config.device).type == "cpu" else "wall-clock"
+    note = (
+        f"{count} problems of each size. seconds: {clock} seconds for all of them (scaled up "
+        f"where fewer were solved); times_qpth: how many times faster than qpth; error_n: "
+        f"largest force error of what is claimed to be solved [N], against "
+        f"{', '.join(sorted(sources))}; wrong: claimed solutions off by more than "
+        f"{config.wrong_above:g} N; failed: not solved."
+    )
+    print("\n" + note)
+    write_results(folder, table, seeds=[config.seed], note=note)
+    with SummaryWriter(str(folder)) as writer:
+        for line in table:
+            for quantity in ("seconds", "error_n", "wrong", "failed"):
+                if line[quantity] is not None:
+                    writer.add_scalar(f"{quantity}/{line['solver']}", line[quantity], line["rows"])
+        writer.add_text("table", "```\n" + format_table(table, formats=FORMATS) + "\n```")
+    print(f"\nwritten to {folder}")
+
+
+def measure(
+    solver: Solver, problem: ContactQP, forces: np.ndarray, config: Benchmark
+) -> dict[str, Any]:
+    """One line of the table: how long a solver takes and how right it is."""
+    import numpy as np
+    import torch
+
+    count = len(forces)
+    used = max(1, round(solver.share * count))
+    given = _moved(problem, slice(0, used), config.device)
+    solver.run(_moved(problem, slice(0, 2), config.device))  # imports and compilation
+    on_cpu = torch.device(config.device).type == "cpu"
+    clock = time.process_time if on_cpu else time.perf_counter
+    seconds, answer = float("inf"), None
+    for _ in range(solver.repeats):
+        start = clock()
+        answer = solver.run(given)
+        seconds = min(seconds, clock() - start)
+    assert answer is not None
+    motions, solved = answer
+    hessian = problem.hessian.expand(count, *problem.hessian.shape[-2:])[:used].numpy()
+    found = np.einsum("bij,bj->bi", hessian, motions - problem.target[:used].numpy())
+    error = np.abs(found - forces[:used]).max(-1)
+    error = np.where(np.isnan(error), np.inf, error)[solved]
+    return {
+        "solver": solver.name,
+        "problems": used,
+        "seconds": seconds * count / used,
+        "times_qpth": None,
+        "error_n": float(error.max()) if len(error) else None,
+        "wrong": int((error > config.wrong_above).sum()),
+        "failed": int((~solved).sum()),
+        "solved": float(solved.mean()),
+    }
+
+
+def _add_ratios(lines: list[dict[str, Any]]) -> None:
+    base = [line["seconds"] for line in lines if line["solver"] == "qpth"]
+    for line in lines:
+        if base:
+            line["times_qpth"] = base[0] / line["seconds"]
+
+
+def _moved(problem: ContactQP, part: slice, device: str) -> ContactQP:
+    """Some of the problems, on a device."""
+    from tpcd.qp import ContactQP
+
+    mask = problem.row_mask
+    return ContactQP(
+        hessian=problem.hessian.to(device),
+        target=problem.target[part].to(device),
+        rows=problem.rows[part].to(device),
+        offsets=problem.offsets[part].to(device),
+        row_mask=None if mask is None else mask[part].to(device),
+    )
+
+
+if __name__ == "__main__":
+    run(benchmark, Benchmark)

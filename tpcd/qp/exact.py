@@ -34,7 +34,7 @@ DEPENDENCE_TOLERANCE = 1e-10
 """A unit row whose rest outside the active span is shorter than this depends on them."""
 RATIO_TOLERANCE = 1e-11
 """A multiplier that shrinks more slowly than this does not block; it is rounding."""
-COMPACTION = 0.7
+COMPACTION = 0.5
 """Finished elements are dropped from the working arrays when at most this fraction is left."""
 
 
@@ -79,34 +79,36 @@ def solve_exact(problem: WhitenedQP, iteration_limit: int | None = None) -> Acti
     problem that is not broken by rounding comes near. Float64, on any device.
     """
     k, m, count = problem.rows.shape
+    s = min(k, m)
     limit = 10 * (m + k) if iteration_limit is None else iteration_limit
-    state = _start(problem)
-    status = state.element.new_full((count,), int(Status.ITERATION_LIMIT))
-    iterations = torch.full_like(status, limit)
-    basis, slots = state.basis.clone(), state.slots.clone()
-    if m == 0 or count == 0:
-        status, iterations = torch.zeros_like(status), torch.zeros_like(status)
-        return _answer(problem, basis, slots, status, iterations)
-
+    basis = problem.offsets.new_zeros(s, k, count)
+    slots = torch.full((s, count), m, device=basis.device)
+    status = torch.zeros(count, dtype=torch.int64, device=basis.device)
+    iterations = torch.zeros_like(status)
+    state = _start(problem, slots)
     finished = torch.zeros_like(state.element, dtype=torch.bool)
+    status[state.element] = int(Status.ITERATION_LIMIT)
+    iterations[state.element] = limit
+
     for step in range(limit + 1):
+        if len(state.element) == 0:
+            break
         worst, chosen = _most_violated(state)
         idle = state.pending == m
         chosen = torch.where(idle, chosen, state.pending)
         done = (worst >= 0) & idle & ~finished
-        over = done | ~finished if step == limit else done
-        at = over.nonzero()[:, 0]
-        where = state.element[at]
-        slots[:, where] = state.slots[:, at]
-        basis[..., where] = state.basis[..., at]
-        settled = state.element[done.nonzero()[:, 0]] if step == limit else where
-        status[settled] = int(Status.SOLVED)
-        iterations[settled] = step
+        where = state.element[done]
+        status[where] = int(Status.SOLVED)
+        iterations[where] = step
+        recorded = (~finished if step == limit else done).nonzero()[:, 0]
+        where = state.element[recorded]
+        slots.index_copy_(1, where, state.slots.index_select(1, recorded))
+        basis.index_copy_(2, where, state.basis.index_select(2, recorded))
         finished |= done
         keep = (~finished).nonzero()[:, 0]
-        if keep.numel() == 0 or step == limit:
+        if len(keep) == 0 or step == limit:
             break
-        if keep.numel() <= COMPACTION * finished.numel():
+        if len(keep) <= COMPACTION * len(finished):
             state = _State(*(part.index_select(part.ndim - 1, keep) for part in state))
             chosen, finished = chosen[keep], finished[keep]
         state, contradicted = _advance(state, chosen)
@@ -127,28 +129,33 @@ def optimality_residual(problem: WhitenedQP, answer: ActiveSet) -> Float[Tensor,
     force = answer.multipliers
     if problem.rows.shape[1] == 0:
         return torch.zeros_like(problem.target[0])
-    slack = _sum(problem.rows * answer.motion[:, None]) + problem.offsets
+    slack = _dot(problem.rows, answer.motion) + problem.offsets
     pushed = _sum((problem.rows * force).transpose(0, 1))
     parts = (-slack, -force, (slack * force).abs(), (answer.motion - pushed).abs())
     worst = torch.stack([part.amax(0) for part in parts]).amax(0)
     return worst.clamp_min(0.0)
 
 
-def _start(problem: WhitenedQP) -> _State:
-    k, m, count = problem.rows.shape
-    s = min(k, m)
-    zeros = problem.offsets.new_zeros
-    element = torch.arange(count, device=problem.rows.device)
+def _start(problem: WhitenedQP, slots: Tensor) -> _State:
+    """The state at w = 0 of those elements that have a violated row there."""
+    k, m, _ = problem.rows.shape
     tolerated = problem.offsets + VIOLATION_TOLERANCE * problem.magnitudes
+    touched = (tolerated < 0).any(0) if m else torch.zeros_like(problem.valid)
+    element = touched.nonzero()[:, 0]
+    count = len(element)
+    zeros = problem.offsets.new_zeros
+    rows = problem.rows.new_empty(k + 1, m, count)
+    torch.index_select(problem.rows, 2, element, out=rows[:k])
+    rows[k] = tolerated.index_select(1, element)
     motion = zeros(k + 1, count)
     motion[k] = 1.0
     return _State(
-        rows=torch.cat((problem.rows, tolerated[None])),
+        rows=rows,
         motion=motion,
-        basis=zeros(s, k, count),
-        active_rows=zeros(s, k, count),
-        forces=zeros(s, count),
-        slots=element.new_full((s, count), m),
+        basis=zeros(len(slots), k, count),
+        active_rows=zeros(len(slots), k, count),
+        forces=zeros(len(slots), count),
+        slots=slots.index_select(1, element),
         pending=torch.full_like(element, m),
         pending_force=zeros(count),
         element=element,

@@ -78,23 +78,26 @@ def whiten(problem: ContactQP) -> WhitenedQP:
         for i in range(n):
             entry = rows[i]
             for j in range(i):
-                entry = entry - factor[i][j] * whitened[j]
+                if factor[i][j].numel() != 1 or bool(factor[i][j] != 0):
+                    entry = entry - factor[i][j] * whitened[j]
             whitened.append(entry / factor[i][i])
-        shift, magnitude = offsets, offsets.abs()
+        shift, magnitude = offsets.clone(), offsets.abs()
         for i in range(n):
             product = rows[i] * target[i]
-            shift, magnitude = shift + product, magnitude + product.abs()
+            shift += product
+            magnitude += product.abs_()
         if compliance is not None:
             spring = compliance.clamp_min(0.0).sqrt()
             own = torch.eye(m, dtype=spring.dtype, device=spring.device)
             whitened.extend(own[i][:, None] * spring for i in range(m))
+        stacked = torch.stack(whitened)
         square = torch.zeros_like(shift)
         for entry in whitened:
-            square = square + entry * entry
-        valid &= (square.isfinite() & shift.isfinite() & magnitude.isfinite()).all(0)
-        length = square.sqrt()
+            square += entry * entry
+        if m:  # the largest of all numbers is finite if all are
+            valid &= (square + magnitude).amax(0).isfinite()
+        length = square.sqrt_()
         length = length.where(length > 0, 1.0)
-        stacked = torch.stack(whitened)
         if not bool(valid.all()):
             stacked = stacked.where(valid, 0.0)
             shift, magnitude = shift.where(valid, 1.0), magnitude.where(valid, 1.0)
@@ -104,9 +107,9 @@ def whiten(problem: ContactQP) -> WhitenedQP:
                 for i, line in enumerate(factor)
             )
         return WhitenedQP(
-            rows=stacked / length,
-            offsets=shift / length,
-            magnitudes=magnitude / length,
+            rows=stacked.div_(length),
+            offsets=shift.div_(length),
+            magnitudes=magnitude.div_(length),
             lengths=length,
             factor=factor,
             target=target,

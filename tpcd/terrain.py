@@ -8,13 +8,14 @@ class with the same two functions. Parameters carry batch axes in front of the p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 
+@runtime_checkable
 class Terrain(Protocol):
     """A body of the world that the held object can touch."""
 

@@ -7,13 +7,14 @@ object frame at scale 1.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 
+@runtime_checkable
 class Shape(Protocol):
     """A family of closed planar outlines indexed by a latent in [-1, 1]^z."""
 

@@ -171,7 +171,7 @@ def _most_violated(state: _State) -> tuple[Tensor, Tensor]:
     excess[m] = torch.inf
     excess.scatter_(0, state.slots, torch.inf)
     worst, chosen = excess.min(0)
-    return worst, chosen
+    return worst, chosen.clamp_max(m - 1)
 
 
 def _advance(state: _State, chosen: Tensor) -> tuple[_State, Tensor]:

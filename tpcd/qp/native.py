@@ -51,8 +51,8 @@ def solve_native(problem: ContactQP, iteration_limit: int | None = None) -> QPSo
     if n == 3 and problem.compliance is None:
         _solve_batch_3(*arguments, limit, answer)
     else:
-        rigid = problem.compliance is None
-        springs = np.empty((count, 0)) if rigid else _array(problem.compliance, count, m)
+        given = problem.compliance
+        springs = np.empty((count, 0)) if given is None else _array(given, count, m)
         _solve_batch_n(*arguments, springs, limit, answer)
     motion, multipliers, active, residual, status, iterations = map(torch.from_numpy, answer)
     return QPSolution(

@@ -12,6 +12,7 @@ Arrays of one scene: `points` (2, p) outline in the end-effector frame, `normals
 from __future__ import annotations
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from numba import njit, prange
@@ -33,6 +34,7 @@ _FAST = {"nnan", "nsz", "contract"}
 
 
 @njit(cache=True, fastmath=_FAST)
+@no_type_check
 def _heights(points, a, b, scratch):
     """Least of a x + b z over the points, leaving all values in `scratch`."""
     lowest = np.inf
@@ -45,6 +47,7 @@ def _heights(points, a, b, scratch):
 
 
 @njit(cache=True)
+@no_type_check
 def _index_of(scratch, value):
     for i in range(scratch.shape[0]):
         if scratch[i] == value:
@@ -53,6 +56,7 @@ def _index_of(scratch, value):
 
 
 @njit(cache=True)
+@no_type_check
 def _lowest(points, normals, offsets, x, z, angle, scratch):
     """Smallest gap over all terrains at a pose, with its point and terrain."""
     cosine, sine = math.cos(angle), math.sin(angle)
@@ -67,6 +71,7 @@ def _lowest(points, normals, offsets, x, z, angle, scratch):
 
 
 @njit(cache=True)
+@no_type_check
 def _first_touch(points, normals, offsets, start, command, scratch):
     """Free fraction of the way from start to command, with the touching point and terrain."""
     value_low, point, terrain = _lowest(
@@ -107,6 +112,7 @@ def _first_touch(points, normals, offsets, start, command, scratch):
 
 
 @njit(cache=True)
+@no_type_check
 def _add_candidate(listed, counts, t, point):
     """Put a point on the list of terrain t; when full it replaces the oldest probe."""
     for k in range(min(counts[t], LIST)):
@@ -117,6 +123,7 @@ def _add_candidate(listed, counts, t, point):
 
 
 @njit(cache=True)
+@no_type_check
 def _scan(points, normals, offsets, pose, turn, reach, listed, counts, scratch):
     """List the lowest point of every terrain within reach, the object turned by `turn`."""
     cosine, sine = math.cos(pose[2] + turn), math.sin(pose[2] + turn)
@@ -128,6 +135,7 @@ def _scan(points, normals, offsets, pose, turn, reach, listed, counts, scratch):
 
 
 @njit(cache=True)
+@no_type_check
 def _contact(points, normals, offsets, t, i, pose, cosine, sine, out):
     """Gap, tangential position and Jacobian rows of point i against terrain t.
 
@@ -146,6 +154,7 @@ def _contact(points, normals, offsets, t, i, pose, cosine, sine, out):
 
 
 @njit(cache=True)
+@no_type_check
 def _tangential(points, normals, t, i, pose):
     cosine, sine = math.cos(pose[2]), math.sin(pose[2])
     x = cosine * points[0, i] - sine * points[1, i] + pose[0]
@@ -154,6 +163,7 @@ def _tangential(points, normals, t, i, pose):
 
 
 @njit(cache=True)
+@no_type_check
 def _build_rows(
     points, normals, offsets, friction, start, command, pose, root, coulomb, compliance,
     listed, counts, load, rows, values, sizes, row_point, row_terrain, row_side, frame,
@@ -187,6 +197,7 @@ def _build_rows(
 
 
 @njit(cache=True)
+@no_type_check
 def _linear_system(
     points, normals, offsets, friction, start, command, pose, stiffness, coulomb, compliance,
     chosen, multiplier, side, slipping, system, frame,
@@ -245,6 +256,7 @@ def _linear_system(
 
 
 @njit(cache=True)
+@no_type_check
 def _invert(system):
     """Invert the 3 x 3 matrix in rows 9-11 in place; False where it is singular."""
     a, b, c = system[9, 0], system[9, 1], system[9, 2]
@@ -266,6 +278,7 @@ def _invert(system):
 
 
 @njit(cache=True)
+@no_type_check
 def _respond(system, chosen, force, row, out):
     """Pose change for right-hand sides of the force balance and of the loaded rows."""
     m0 = m1 = m2 = 0.0
@@ -290,6 +303,7 @@ def _respond(system, chosen, force, row, out):
 
 
 @njit(cache=True)
+@no_type_check
 def _settle(
     points, normals, offsets, friction, start, command, stiffness, root, extent, coulomb,
     rounds, tolerance, compliance, scratch, listed, counts, load, rows, values, sizes, lengths,
@@ -372,12 +386,16 @@ def _settle(
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@no_type_check
 def step_all(
-    points, normals, offsets, friction, owner, starts, commands, stiffness, coulomb, substeps,
-    rounds, tolerance, compliance, chunks,
+    points, normals, offsets, friction, owner, starts, previous, commands, rested, stiffness,
+    coulomb, substeps, follow_path, rounds, tolerance, compliance, chunks,
     poses, modes, statuses, residuals, from_start, from_gap, from_lever,
 ):
-    """Step every transition; `owner` names the scene of each. Outputs are filled in place."""
+    """Step every transition; `owner` names the scene of each. Outputs are filled in place.
+
+    `rested` says that nothing was commanded before, so that `previous` equals the start.
+    """
     count, terrains = starts.shape[0], normals.shape[1]
     for chunk in prange(chunks):
         scratch = np.empty(points.shape[2])
@@ -390,13 +408,14 @@ def step_all(
         work, frame, system = np.empty((8, 3)), np.empty(10), np.empty((15, 3))
         chosen, multiplier, side = np.zeros((3, 2), np.int64), np.zeros(3), np.zeros(3)
         slipping = np.zeros(3, np.bool_)
-        start, command, part, pose = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+        start, before, command = np.empty(3), np.empty(3), np.empty(3)
+        part, landing, pose, first = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
         vector, force, row_right = np.empty(3), np.empty(3), np.empty(3)
-        landing, land, land_gap = np.empty(3), np.zeros((3, 3)), np.zeros((terrains, 3))
-        whole, whole_gap = np.zeros((3, 3)), np.zeros((terrains, 3))
-        whole_lever, no_lever = np.zeros((terrains, 3)), np.zeros((terrains, 3))
-        by_start, by_command = np.zeros((3, 3)), np.zeros((3, 3))
-        by_gap, by_lever = np.zeros((terrains, 3)), np.zeros((terrains, 3))
+        # Derivatives: rows 0-2 of the whole step by the start, then by gaps, then by levers.
+        height = 3 + 2 * terrains
+        whole, kept, response = np.zeros((height, 3)), np.zeros((height, 3)), np.zeros((9, 3))
+        by_terrain, land = np.zeros((2 * terrains, 3)), np.zeros((6, 3))
+        land_gap = np.zeros((terrains, 3))
         root = np.sqrt(stiffness)
         owned, extent = -1, 0.0
         for b in range(chunk * count // chunks, (chunk + 1) * count // chunks):
@@ -410,70 +429,135 @@ def step_all(
             for t in range(terrains):
                 finite = finite and math.isfinite(offsets[o, t]) and math.isfinite(friction[o, t])
             for a in range(3):
-                start[a], command[a] = starts[b, a], commands[b, a]
-                finite = finite and math.isfinite(start[a]) and math.isfinite(command[a])
+                start[a], before[a], command[a] = starts[b, a], previous[b, a], commands[b, a]
+                finite = finite and math.isfinite(start[a] + before[a] + command[a])
             if not finite:
                 statuses[b], residuals[b] = INVALID, np.inf
                 poses[b], modes[b] = np.nan, 0
                 from_start[b], from_gap[b], from_lever[b] = np.nan, np.nan, np.nan
                 continue
-            turn = command[2] - start[2]
-            command[2] = start[2] + math.pi - (math.pi - turn) % (2.0 * math.pi)
-            fraction, point, terrain = _first_touch(
-                points[o], normals[o], offsets[o], start, command, scratch
-            )
+            before[2] = start[2] + _wrap(before[2] - start[2])
+            command[2] = start[2] + _wrap(command[2] - start[2])
+            whole[:] = 0.0
             for a in range(3):
-                landing[a] = start[a] + fraction * (command[a] - start[a])
-                pose[a] = landing[a]
-            if fraction == 1.0:
-                poses[b], modes[b], statuses[b], residuals[b] = command, 0, CONVERGED, 0.0
-                from_start[b], from_gap[b], from_lever[b] = 0.0, 0.0, 0.0
-                continue
-            _landing_response(
-                points[o], normals[o], offsets[o], start, command, fraction, point, terrain,
-                land, land_gap, frame,
-            )
-            whole[:], whole_gap[:], whole_lever[:] = land, land_gap, 0.0
-            status, residual = CONVERGED, 0.0
-            for k in range(substeps):
-                share = (k + 1) / substeps
+                pose[a] = start[a]
+                whole[a, a] = 1.0
+            touching, status, residual = 0, CONVERGED, 0.0
+            # Run 0 puts the start on what it rests against, run 1 goes straight to the
+            # command, runs 2.. follow the command's path where contact has changed.
+            run, last = (1 if rested else 0), 1
+            if rested:
+                touching = _touching(points[o], normals[o], offsets[o], pose, scratch)
+            while run <= last:
+                if run == 1:
+                    first[:], kept[:] = pose, whole
+                    share = 1.0
+                elif run == 0:
+                    share = 0.0
+                else:
+                    share = (run - 1) / substeps
+                if run == 2:
+                    pose[:], whole[:] = first, kept
+                    status, residual = CONVERGED, 0.0
                 for a in range(3):
+                    part[a] = before[a] + share * (command[a] - before[a])
                     start[a] = pose[a]
-                    part[a] = landing[a] + share * (command[a] - landing[a])
-                ended, left = _settle(
-                    points[o], normals[o], offsets[o], friction[o], start, part, stiffness, root,
-                    extent, coulomb, rounds, tolerance, compliance, scratch, listed, counts, load,
-                    rows, values, sizes, lengths, multipliers, row_point, row_terrain, row_side,
-                    motion, slots, work, frame, system, chosen, multiplier, side, slipping, pose,
-                    vector, force, row_right,
+                fraction, point, terrain = _first_touch(
+                    points[o], normals[o], offsets[o], start, part, scratch
                 )
-                status, residual = max(status, ended), max(residual, left)
-                if status == RELAXED:
-                    break
-                _linear_system(
-                    points[o], normals[o], offsets[o], friction[o], start, part, pose,
-                    stiffness, coulomb, compliance, chosen, multiplier, side, slipping,
-                    system, frame,
-                )
-                _responses(
-                    system, chosen, stiffness, load, terrains, by_start, by_command, by_gap,
-                    by_lever, force, row_right, vector,
-                )
-                _chain(whole, land, by_start, by_command, share, vector)
-                _chain_rows(whole_gap, land_gap, by_start, by_command, by_gap, share, vector)
-                _chain_rows(whole_lever, no_lever, by_start, by_command, by_lever, share, vector)
+                for a in range(3):
+                    landing[a] = start[a] + fraction * (part[a] - start[a])
+                    pose[a] = landing[a]
+                if fraction == 1.0:
+                    for j in range(3):
+                        chosen[j, 0] = -1
+                    whole[:] = 0.0
+                    for a in range(3):
+                        whole[a, a] = 1.0 - share if rested else 0.0
+                else:
+                    _landing_response(
+                        points[o], normals[o], offsets[o], start, part, fraction, point, terrain,
+                        land, land_gap, frame,
+                    )
+                    ended, left = _settle(
+                        points[o], normals[o], offsets[o], friction[o], landing, part, stiffness,
+                        root, extent, coulomb, rounds, tolerance, compliance, scratch, listed,
+                        counts, load, rows, values, sizes, lengths, multipliers, row_point,
+                        row_terrain, row_side, motion, slots, work, frame, system, chosen,
+                        multiplier, side, slipping, pose, vector, force, row_right,
+                    )
+                    if ended == RELAXED:
+                        status = RELAXED
+                        break
+                    status, residual = max(status, ended), max(residual, left)
+                    _linear_system(
+                        points[o], normals[o], offsets[o], friction[o], landing, part, pose,
+                        stiffness, coulomb, compliance, chosen, multiplier, side, slipping,
+                        system, frame,
+                    )
+                    _responses(
+                        system, chosen, stiffness, load, terrains, response, by_terrain, force,
+                        row_right, vector,
+                    )
+                    _chain(
+                        whole, response, by_terrain, land, land_gap,
+                        1.0 - share if rested else 0.0, vector, force,
+                    )
+                if run == 0:
+                    touching, status, residual = _loaded(chosen), CONVERGED, 0.0
+                elif run == 1 and substeps > 1:
+                    now = _loaded(chosen)
+                    changed = now != 0 and now != touching
+                    if follow_path or changed and (touching != 0 or now & (now - 1) != 0):
+                        last = substeps + 1
+                run += 1
             for a in range(3):
                 poses[b, a] = pose[a]
             _modes(chosen, multiplier, side, slipping, modes[b])
             statuses[b], residuals[b] = status, residual
-            from_start[b], from_gap[b], from_lever[b] = whole, whole_gap, whole_lever
+            from_start[b] = whole[:3]
+            from_gap[b] = whole[3 : 3 + terrains]
+            from_lever[b] = whole[3 + terrains :]
 
 
 @njit(cache=True)
+@no_type_check
+def _wrap(angle):
+    """The angle wrapped to (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+@njit(cache=True)
+@no_type_check
+def _touching(points, normals, offsets, pose, scratch):
+    """Bit mask of the terrains within `_FREE_GAP` of the object."""
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    mask = 0
+    for t in range(normals.shape[0]):
+        nx, nz = normals[t, 0], normals[t, 1]
+        low = _heights(points, cosine * nx + sine * nz, cosine * nz - sine * nx, scratch)
+        if low + nx * pose[0] + nz * pose[1] - offsets[t] <= _FREE_GAP:
+            mask |= 1 << t
+    return mask
+
+
+@njit(cache=True)
+@no_type_check
+def _loaded(chosen):
+    """Bit mask of the terrains that carry load."""
+    mask = 0
+    for j in range(3):
+        if chosen[j, 0] >= 0:
+            mask |= 1 << chosen[j, 1]
+    return mask
+
+
+@njit(cache=True)
+@no_type_check
 def _landing_response(
     points, normals, offsets, start, command, fraction, point, terrain, land, land_gap, frame
 ):
-    """Derivatives of the first-touch pose by the start pose and by the gaps."""
+    """Derivatives of the first-touch pose by start (rows 0-2), command (3-5) and gaps."""
     land[:], land_gap[:] = 0.0, 0.0
     for a in range(3):
         land[a, a] = 1.0
@@ -490,68 +574,79 @@ def _landing_response(
         share = (command[a] - start[a]) / approach
         land_gap[terrain, a] = share
         for c in range(3):
-            land[a, c] = (1.0 - fraction) * (land[a, c] + share * frame[2 + c])
+            turn = (1.0 if a == c else 0.0) + share * frame[2 + c]
+            land[a, c] = (1.0 - fraction) * turn
+            land[3 + a, c] = fraction * turn
 
 
 @njit(cache=True)
+@no_type_check
 def _responses(
-    system, chosen, stiffness, load, terrains, by_start, by_command, by_gap, by_lever, force, row,
-    vector,
+    system, chosen, stiffness, load, terrains, response, by_terrain, force, row, vector
 ):
-    """Derivatives of the settled pose by start, command, and gap and lever of each terrain."""
+    """Derivatives of the settled pose: by start and command (6 rows of `response`, as matrices),
+    by the gap and the lever of each terrain (rows of `by_terrain`)."""
     for c in range(3):
         for j in range(3):
             force[j], row[j] = 0.0, -system[12 + j, c]
         _respond(system, chosen, force, row, vector)
         for a in range(3):
-            by_start[a, c] = vector[a]
+            response[a, c] = vector[a]
             row[a] = 0.0
         force[c] = stiffness[c]
         _respond(system, chosen, force, row, vector)
         for a in range(3):
-            by_command[a, c] = vector[a]
+            response[3 + a, c] = vector[a]
     for t in range(terrains):
         for j in range(3):
             force[j] = 0.0
             row[j] = -1.0 if (chosen[j, 0] >= 0 and chosen[j, 1] == t) else 0.0
         _respond(system, chosen, force, row, vector)
         for a in range(3):
-            by_gap[t, a] = vector[a]
+            by_terrain[t, a] = vector[a]
             row[a] = 0.0
         force[2] = load[t]
         _respond(system, chosen, force, row, vector)
         for a in range(3):
-            by_lever[t, a] = vector[a]
+            by_terrain[terrains + t, a] = vector[a]
 
 
 @njit(cache=True)
-def _chain(whole, land, by_start, by_command, share, column):
-    """Append one substep to the derivative of the whole step by the start pose."""
+@no_type_check
+def _chain(whole, response, by_terrain, land, land_gap, follows, column, middle):
+    """Append one settling to the derivatives of the whole step.
+
+    `follows` is how much the command of this part moves with the start pose.
+    """
+    terrains = land_gap.shape[0]
     for c in range(3):
         for a in range(3):
             column[a] = whole[a, c]
         for a in range(3):
-            value = 0.0
+            middle[a] = follows * land[3 + a, c]
             for k in range(3):
-                value += by_start[a, k] * column[k] + (1.0 - share) * by_command[a, k] * land[k, c]
+                middle[a] += land[a, k] * column[k]
+        for a in range(3):
+            value = follows * response[3 + a, c]
+            for k in range(3):
+                value += response[a, k] * middle[k]
             whole[a, c] = value
-
-
-@njit(cache=True)
-def _chain_rows(whole, land, by_start, by_command, by_input, share, column):
-    """The same for a derivative kept as one row for each terrain."""
-    for t in range(whole.shape[0]):
+    for r in range(2 * terrains):
         for a in range(3):
-            column[a] = whole[t, a]
+            column[a] = whole[3 + r, a]
         for a in range(3):
-            value = by_input[t, a]
+            middle[a] = land_gap[r, a] if r < terrains else 0.0
             for k in range(3):
-                value += by_start[a, k] * column[k]
-                value += (1.0 - share) * by_command[a, k] * land[t, k]
-            whole[t, a] = value
+                middle[a] += land[a, k] * column[k]
+        for a in range(3):
+            value = by_terrain[r, a]
+            for k in range(3):
+                value += response[a, k] * middle[k]
+            whole[3 + r, a] = value
 
 
 @njit(cache=True)
+@no_type_check
 def _modes(chosen, multiplier, side, slipping, modes):
     """Contact mode against each terrain, from the row that carries the largest load."""
     for t in range(modes.shape[0]):

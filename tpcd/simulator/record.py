@@ -52,8 +52,11 @@ class StepSettings:
     friction: Literal["coulomb", "anitescu"] = "coulomb"
     """`anitescu` is the convex relaxation (a sliding body is lifted by friction x slip);
     `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
-    substeps: int = 1
-    """The command is approached in this many equal parts; more follow the path of friction."""
+    substeps: int = 4
+    """Parts into which the command's path is cut where contact with floor or wall is won or
+    lost on the way, since friction then depends on the path; other steps are one part."""
+    follow_path: bool = False
+    """Cut every step into `substeps` parts, whether contact changes or not."""
     rounds: int = 20
     """Cap on re-linearisations of geometry and friction in one substep."""
     tolerance: float = 1e-7

@@ -7,16 +7,17 @@ on a CPU where numba is installed, compiled loops do the same work.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.contact import ContactScene
+from tpcd.contact import ContactScene, terrain_gaps
 from tpcd.planar import wrap_angle
 from tpcd.simulator import native
-from tpcd.simulator.flight import Flight, first_touch, touch_row
+from tpcd.simulator.flight import FREE_GAP, Flight, first_touch, touch_row
 from tpcd.simulator.implicit import linear_response, newton_pose
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus, Transition
 from tpcd.simulator.settle import Settled, settle
@@ -33,25 +34,35 @@ def simulate_step(
     stiffness: Float[Tensor, " 3"],
     settings: StepSettings = DEFAULT_SETTINGS,
     engine: Engine = "auto",
+    previous: Float[Tensor, "*#batch 3"] | None = None,
 ) -> Transition:
     """Settle at `command` [m, m, rad] from the start pose `pose`.
 
-    The batch axes of `scene`, `pose` and `command` are broadcast against each other.
+    `previous` is the command at which the arm rested in the start pose. It tells what the
+    object was pressed against, and where the command's path begins, on which friction
+    depends; a measured start pose is first settled under it, which puts it back on the
+    contact it had. Without it the arm is taken to rest without load, `previous = pose`.
+
+    The batch axes of `scene`, `pose` and the commands are broadcast against each other.
     `stiffness` is the diagonal of K [N/m, N/m, N·m/rad]. Contact is solved in float64.
     Raises ValueError for a stiffness that is not positive.
     """
     if stiffness.shape != (3,) or not bool((stiffness > 0).all()):
         raise ValueError(f"stiffness is {stiffness.tolist()}, expected three positive numbers")
-    batch = torch.broadcast_shapes(scene.batch_shape, pose.shape[:-1], command.shape[:-1])
+    commands = (command,) if previous is None else (command, previous)
+    batch = torch.broadcast_shapes(
+        scene.batch_shape, pose.shape[:-1], *(given.shape[:-1] for given in commands)
+    )
     pose = pose.expand(*batch, 3).reshape(-1, 3)
     command = command.expand(*batch, 3).reshape(-1, 3)
+    previous = None if previous is None else previous.expand(*batch, 3).reshape(-1, 3)
     owner = torch.arange(scene.batch_shape.numel(), device=pose.device)
     owner = owner.reshape(scene.batch_shape).expand(batch).reshape(-1)
-    if _use_native(engine, scene, pose, command, stiffness):
-        flat = native.step(scene, owner, pose, command, stiffness, settings)
-        _relax_jammed(flat, scene, owner, pose, command, stiffness, settings)
+    if _use_native(engine, scene, (pose, stiffness, command, *(() if previous is None else (previous,)))):
+        flat = native.step(scene, owner, pose, previous, command, stiffness, settings)
+        _relax_jammed(flat, scene, owner, pose, previous, command, stiffness, settings)
     else:
-        flat = _step(scene.gather(owner), pose, command, stiffness, settings)
+        flat = _step(scene.gather(owner), pose, previous, command, stiffness, settings)
     return Transition(
         pose=flat.pose.reshape(*batch, 3),
         wrench=flat.wrench.reshape(*batch, 3),
@@ -71,13 +82,16 @@ def rollout(
     stiffness: Float[Tensor, " 3"],
     settings: StepSettings = DEFAULT_SETTINGS,
     engine: Engine = "auto",
+    previous: Float[Tensor, "*#batch 3"] | None = None,
 ) -> list[Transition]:
     """Run n commands in a row, each from the pose at which the one before came to rest."""
     transitions = []
     for command in commands:
-        transition = simulate_step(scene, pose, command, stiffness, settings, engine)
+        transition = simulate_step(
+            scene, pose, command, stiffness, settings, engine, previous=previous
+        )
         transitions.append(transition)
-        pose = transition.pose
+        pose, previous = transition.pose, command
     return transitions
 
 
@@ -86,14 +100,12 @@ def needs_gradient(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
-def _use_native(
-    engine: Engine, scene: ContactScene, pose: Tensor, command: Tensor, stiffness: Tensor
-) -> bool:
+def _use_native(engine: Engine, scene: ContactScene, given: tuple[Tensor, ...]) -> bool:
     bodies = [body for body in scene.terrains if isinstance(body, HalfPlane)]
     planes = [value for body in bodies for value in (body.direction, body.offset)]
-    inputs = (scene.points_ee, scene.friction, pose, command, stiffness, *planes)
+    inputs = (scene.points_ee, scene.friction, *given, *planes)
     possible = (
-        pose.device.type == "cpu"
+        scene.friction.device.type == "cpu"
         and len(bodies) == len(scene.terrains)
         and not needs_gradient(*inputs)
         and native.available()
@@ -111,6 +123,7 @@ def _relax_jammed(
     scene: ContactScene,
     owner: Tensor,
     pose: Tensor,
+    previous: Tensor | None,
     command: Tensor,
     stiffness: Tensor,
     settings: StepSettings,
@@ -119,61 +132,148 @@ def _relax_jammed(
     jammed = torch.nonzero(flat.status == int(StepStatus.RELAXED)).flatten()
     if len(jammed) == 0:
         return
-    part = _step(scene.gather(owner[jammed]), pose[jammed], command[jammed], stiffness, settings)
+    before = None if previous is None else previous[jammed]
+    part = _step(
+        scene.gather(owner[jammed]), pose[jammed], before, command[jammed], stiffness, settings
+    )
     for name in vars(part):
         getattr(flat, name)[jammed] = getattr(part, name)
 
 
+@dataclass(frozen=True)
+class _State:
+    """Where the object is after part of a step, with derivatives by the start of the step."""
+
+    pose: Tensor
+    from_start: Tensor
+    from_gap: Tensor
+    from_lever: Tensor
+    mode: Tensor
+    status: Tensor
+    residual: Tensor
+
+    def where(self, condition: Tensor, other: _State) -> _State:
+        """This state where the condition holds, the other one elsewhere."""
+        values = {}
+        for name, value in vars(self).items():
+            shape = (-1, *([1] * (value.ndim - 1)))
+            values[name] = torch.where(condition.reshape(shape), value, getattr(other, name))
+        return _State(**values)
+
+
 def _step(
-    scene: ContactScene, start: Tensor, command: Tensor, stiffness: Tensor, settings: StepSettings
+    scene: ContactScene,
+    start: Tensor,
+    previous: Tensor | None,
+    command: Tensor,
+    stiffness: Tensor,
+    settings: StepSettings,
 ) -> Transition:
-    start, command, stiffness = start.double(), command.double(), stiffness.double()
-    scene = scene.double()
-    # The arm turns the short way round.
-    turn = start[:, 2:] + wrap_angle(command[:, 2:] - start[:, 2:])
-    command = torch.cat((command[:, :2], turn), dim=-1)
-    flight = first_touch(scene, start, command)
-    landing, landing_from_start, landing_from_gap = _fly(scene, start, command, flight)
-    pose, from_start, from_gap = landing, landing_from_start, landing_from_gap
-    from_lever = torch.zeros_like(from_gap)
-    status = torch.full_like(flight.point, int(StepStatus.CONVERGED))
-    residual = torch.zeros_like(flight.fraction)
-    settled = None
-    for k in range(settings.substeps):
-        share = (k + 1) / settings.substeps
-        part = landing + (command - landing) * share
-        settled = settle(scene, pose, part, stiffness, settings)
-        arguments = (scene, pose, part, stiffness, settled.pose, settled.contacts, settings)
-        response = linear_response(*arguments)
-        from_start = (
-            response.start @ from_start + (1 - share) * response.command @ landing_from_start
+    start, stiffness, scene = start.double(), stiffness.double(), scene.double()
+    command = _unwrapped(command.double(), start)
+    begin = _start_state(scene, start)
+    rested = previous is None
+    if rested:
+        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
+        touching = gaps.amin(-1) <= FREE_GAP
+        path_start = start
+    else:
+        path_start = _unwrapped(previous.double(), start)
+        begin = _advance(scene, begin, path_start, 0.0, stiffness, settings)
+        begin = replace(
+            begin,
+            status=torch.zeros_like(begin.status),
+            residual=torch.zeros_like(begin.residual),
         )
-        from_gap = (
-            response.gap
-            + from_gap @ response.start.mT
-            + (1 - share) * landing_from_gap @ response.command.mT
-        )
-        from_lever = response.lever + from_lever @ response.start.mT
-        pose = newton_pose(*arguments)
-        status = torch.maximum(status, settled.status)
-        residual = torch.maximum(residual, settled.residual)
-    assert settled is not None
+        touching = begin.mode > 0
+    # How much the command of a part moves with the start pose.
+    follows = 1.0 if rested else 0.0
+    end = _advance(scene, begin, command, 0.0, stiffness, settings)
+    loaded = end.mode > 0
+    changed = loaded.any(-1) & (loaded != touching).any(-1)
+    winding = changed & (touching.any(-1) | (loaded.sum(-1) > 1))
+    if settings.follow_path:
+        winding = torch.ones_like(winding)
+    index = torch.nonzero(winding).flatten()
+    if settings.substeps > 1 and len(index) > 0:
+        part_scene = scene.gather(index)
+        state = _State(**{name: value[index] for name, value in vars(begin).items()})
+        for k in range(1, settings.substeps + 1):
+            share = k / settings.substeps
+            target = path_start[index] + share * (command[index] - path_start[index])
+            state = _advance(
+                part_scene, state, target, follows * (1 - share), stiffness, settings
+            )
+        spread = torch.zeros_like(winding, dtype=torch.long)
+        spread[index] = torch.arange(len(index), device=index.device)
+        followed = _State(**{name: value[spread] for name, value in vars(state).items()})
+        end = followed.where(winding, end)
     return Transition(
-        pose=torch.cat((pose[:, :2], wrap_angle(pose[:, 2:])), dim=-1),
-        wrench=stiffness * (pose - command),
+        pose=torch.cat((end.pose[:, :2], wrap_angle(end.pose[:, 2:])), dim=-1),
+        wrench=stiffness * (end.pose - command),
+        mode=end.mode,
+        status=end.status,
+        residual=end.residual,
+        pose_from_start=end.from_start,
+        pose_from_gap=end.from_gap,
+        pose_from_lever=end.from_lever,
+    )
+
+
+def _unwrapped(command: Tensor, start: Tensor) -> Tensor:
+    """The command with its angle turned by full turns to be the one nearest to the start's."""
+    turn = start[:, 2:] + wrap_angle(command[:, 2:] - start[:, 2:])
+    return torch.cat((command[:, :2], turn), dim=-1)
+
+
+def _start_state(scene: ContactScene, start: Tensor) -> _State:
+    count, terrains = scene.friction.shape
+    zeros = start.new_zeros(count, terrains, 3)
+    whole = torch.zeros(count, dtype=torch.long, device=start.device)
+    return _State(
+        pose=start,
+        from_start=torch.eye(3).to(start).expand(count, 3, 3),
+        from_gap=zeros,
+        from_lever=zeros,
+        mode=torch.zeros(count, terrains, dtype=torch.long, device=start.device),
+        status=whole,
+        residual=start.new_zeros(count),
+    )
+
+
+def _advance(
+    scene: ContactScene,
+    state: _State,
+    target: Tensor,
+    follows: float,
+    stiffness: Tensor,
+    settings: StepSettings,
+) -> _State:
+    """Settle at one command of the path: free flight first, then contact."""
+    flight = first_touch(scene, state.pose, target)
+    landing, by_start, by_target, by_gap = _fly(scene, state.pose, target, flight)
+    settled = settle(scene, landing, target, stiffness, settings)
+    arguments = (scene, landing, target, stiffness, settled.pose, settled.contacts, settings)
+    response = linear_response(*arguments)
+    free = flight.fraction >= 1
+    landed_from_start = by_start @ state.from_start + follows * by_target
+    landed_from_gap = by_gap + state.from_gap @ by_start.mT
+    landed_from_lever = state.from_lever @ by_start.mT
+    return _State(
+        pose=torch.where(free[:, None], target, newton_pose(*arguments)),
+        from_start=response.start @ landed_from_start + follows * response.command,
+        from_gap=response.gap + landed_from_gap @ response.start.mT,
+        from_lever=response.lever + landed_from_lever @ response.start.mT,
         mode=_contact_modes(settled, len(scene.terrains)),
-        status=status,
-        residual=residual,
-        pose_from_start=from_start,
-        pose_from_gap=from_gap,
-        pose_from_lever=from_lever,
+        status=torch.maximum(state.status, settled.status),
+        residual=torch.maximum(state.residual, settled.residual),
     )
 
 
 def _fly(
     scene: ContactScene, start: Tensor, command: Tensor, flight: Flight
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose at the first touch, and its derivatives by the start pose and the gaps."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pose at the first touch, and its derivatives by start pose, command and gaps."""
     way = command - start
     fraction = flight.fraction[:, None]
     flies = (flight.fraction > 0) & (flight.fraction < 1)
@@ -186,15 +286,14 @@ def _fly(
     landing = torch.where(flight.fraction[:, None] > 0, landing, start)
     landing = torch.where(flight.fraction[:, None] < 1, landing, command)
     with torch.no_grad():
-        by_gap = torch.where(flies, 1.0 / approach, 0.0)[:, None] * way
+        by_time = torch.where(flies, 1.0 / approach, 0.0)[:, None] * way
         identity = torch.eye(3, dtype=start.dtype, device=start.device)
-        from_start = (1 - fraction[..., None]) * (
-            identity + by_gap[:, :, None] * torch.where(flies[:, None], row, 0.0)[:, None, :]
-        )
+        turn = identity + by_time[:, :, None] * torch.where(flies[:, None], row, 0.0)[:, None, :]
         terrains = torch.arange(len(scene.terrains), device=start.device)
         here = (terrains == flight.terrain[:, None]).to(start.dtype)
-        from_gap = here[..., None] * by_gap[:, None, :]
-    return landing, from_start, from_gap
+        by_gap = here[..., None] * by_time[:, None, :]
+        share = fraction[..., None]
+    return landing, (1 - share) * turn, share * turn, by_gap
 
 
 def _contact_modes(settled: Settled, terrains: int) -> Tensor:

@@ -11,7 +11,7 @@ from tpcd.simulator.record import StepSettings, StepStatus
 from tpcd.simulator.step import simulate_step
 from tpcd.terrain import floor, wall
 
-TRUTH_SETTINGS = StepSettings(friction="coulomb", substeps=10, rounds=40)
+TRUTH_SETTINGS = StepSettings(friction="coulomb", substeps=10, follow_path=True, rounds=40)
 
 
 class QuasistaticTruth:
@@ -19,7 +19,7 @@ class QuasistaticTruth:
 
     `outline_vertices_ee` are the outline's vertices, scaled and mounted, in the
     end-effector frame [m]; floor height and wall position are world z and x [m]; stiffness
-    is the diagonal of K [N/m, N/m, N·m/rad]. The model has no memory but the pose.
+    is the diagonal of K [N/m, N/m, N·m/rad]. Its state is the pose and the last command.
     """
 
     def __init__(
@@ -40,25 +40,37 @@ class QuasistaticTruth:
         self._stiffness = stiffness.double()
         self._settings = settings
         self._pose = torch.zeros(3, dtype=torch.float64)
+        self._command = self._pose
 
     def reset(self, pose: Float[Tensor, " 3"]) -> None:
         """Put the arm at rest at a pose [m, m, rad]."""
         self._pose = pose.double()
+        self._command = self._pose
 
     def step(
         self, command: Float[Tensor, " 3"]
     ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
         """Move to a command; settled pose, wrench [N, N, N·m] and whether it settled."""
-        pose, wrench, settled = self.step_from(self._pose, command)
-        self._pose = pose
-        return pose, wrench, settled
+        answer = self._settle(self._pose, self._command, command)
+        self._pose, self._command = answer[0], command.double()
+        return answer
 
     def step_from(
         self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]
     ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
         """One transition from rest at a pose, leaving the state alone."""
+        return self._settle(pose.double(), None, command)
+
+    def _settle(
+        self, pose: Tensor, previous: Tensor | None, command: Tensor
+    ) -> tuple[Tensor, Tensor, bool]:
         result = simulate_step(
-            self._scene, pose.double(), command.double(), self._stiffness, self._settings
+            self._scene,
+            pose,
+            command.double(),
+            self._stiffness,
+            self._settings,
+            previous=previous,
         )
         settled = bool(result.status == int(StepStatus.CONVERGED))
         return result.pose, result.wrench, settled

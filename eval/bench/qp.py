@@ -11,6 +11,7 @@ machine matters less, and the ratio to qpth is taken within the run.
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,14 +87,18 @@ def benchmark(config: Benchmark) -> None:
         forces, source = reference_forces(problem)
         sources.add(source)
         for solver in available_solvers(config.device):
-            print(f"\r{rows} rows: {solver.name:<20}", end="", flush=True)
+            print(f"\r{rows} rows: {solver.name:<20}", end="", file=sys.stderr, flush=True)
             table.append({"rows": rows, **measure(solver, problem, forces, config)})
-        _add_ratios([line for line in table if line["rows"] == rows])
-    print("\r" + " " * 40 + "\r" + format_table(table, formats=FORMATS))
+    if len(config.rows) > 1:
+        table += totals(table)
+    _add_ratios(table)
+    print("\r" + " " * 40 + "\r", end="", file=sys.stderr, flush=True)
+    print(format_table(table, formats=FORMATS))
     clock = "CPU" if torch.device(config.device).type == "cpu" else "wall-clock"
     note = (
         f"{count} problems of each size. seconds: {clock} seconds for all of them (scaled up "
-        f"where fewer were solved); times_qpth: how many times faster than qpth; error_n: "
+        f"where fewer were solved); times_qpth: how many times faster than the engine "
+        f"qpth ('qpth plain' is one call of the package, which gives up early); error_n: "
         f"largest force error of what is claimed to be solved [N], against "
         f"{', '.join(sorted(sources))}; wrong: claimed solutions off by more than "
         f"{config.wrong_above:g} N; failed: not solved."
@@ -103,7 +108,7 @@ def benchmark(config: Benchmark) -> None:
     with SummaryWriter(str(folder)) as writer:
         for line in table:
             for quantity in ("seconds", "error_n", "wrong", "failed"):
-                if line[quantity] is not None:
+                if line[quantity] is not None and line["rows"] != "all":
                     writer.add_scalar(f"{quantity}/{line['solver']}", line[quantity], line["rows"])
         writer.add_text("table", "```\n" + format_table(table, formats=FORMATS) + "\n```")
     print(f"\nwritten to {folder}")
@@ -145,11 +150,34 @@ def measure(
     }
 
 
-def _add_ratios(lines: list[dict[str, Any]]) -> None:
-    base = [line["seconds"] for line in lines if line["solver"] == "qpth"]
-    for line in lines:
-        if base:
-            line["times_qpth"] = base[0] / line["seconds"]
+def totals(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line for each solver over all sizes."""
+    lines = []
+    for solver in dict.fromkeys(line["solver"] for line in table):
+        own = [line for line in table if line["solver"] == solver]
+        count = sum(line["problems"] for line in own)
+        errors = [line["error_n"] for line in own if line["error_n"] is not None]
+        lines.append(
+            {
+                "rows": "all",
+                "solver": solver,
+                "problems": count,
+                "seconds": sum(line["seconds"] for line in own),
+                "times_qpth": None,
+                "error_n": max(errors, default=None),
+                "wrong": sum(line["wrong"] for line in own),
+                "failed": sum(line["failed"] for line in own),
+                "solved": 1 - sum(line["failed"] for line in own) / count,
+            }
+        )
+    return lines
+
+
+def _add_ratios(table: list[dict[str, Any]]) -> None:
+    base = {line["rows"]: line["seconds"] for line in table if line["solver"] == "qpth"}
+    for line in table:
+        if line["rows"] in base:
+            line["times_qpth"] = base[line["rows"]] / line["seconds"]
 
 
 def _moved(problem: ContactQP, part: slice, device: str) -> ContactQP:

@@ -41,8 +41,12 @@ class LayoutConfig:
     """Largest absolute coordinate of an initial code."""
     attempts: int = 6
     """Site layouts to try (two dimensions); the one with the most alike neighbours wins."""
-    neighbours: int = 8
-    """Morphs combine a code with some of this many nearest codes (more dimensions)."""
+    neighbours: int = 12
+    """Morphs combine three of a code and its this many nearest codes (more dimensions)."""
+    jitter: float = 0.1
+    """Noise on latents in between, as a share of the codes' standard deviation."""
+    components: int = 24
+    """Components of the fitted density (more dimensions)."""
     between: int = 8000
     """Latents in between to train on."""
     object_samples: int = 8000
@@ -65,15 +69,17 @@ class NetworkConfig:
     """Units of each hidden layer of the signed distance."""
     sdf_depth: int = 4
     """Hidden layers of the signed distance."""
-    head_width: int = 128
+    head_width: int = 192
     """Units of each hidden layer of the outline head."""
     head_depth: int = 3
     """Hidden layers of the outline head."""
-    point_frequency: float = 8.0
+    disc_radius: float = 0.05
+    """The network learns the difference from the distance to this disc [m]; 0: everything."""
+    point_frequency: float = 6.0
     """Largest initial first-layer weight on a coordinate in units of 0.1 m."""
     latent_frequency: float = 3.0
     """Largest initial first-layer weight on a latent entry, in the signed distance."""
-    head_frequency: float = 5.0
+    head_frequency: float = 12.0
     """Largest initial first-layer weight on a latent entry, in the head."""
 
 
@@ -81,10 +87,12 @@ class NetworkConfig:
 class OptimConfig:
     """Optimiser and loss weights. Muon moves the hidden matrices, Adam everything else."""
 
-    steps: int = 3000
+    steps: int = 2000
     """Optimiser steps."""
     batch: int = 2048
-    """Points of a step, half around the outlines and half in between."""
+    """Points of a step."""
+    between_share: float = 0.6
+    """Share of a step's points that lie around outlines in between."""
     adam_rate: float = 5e-3
     """Peak learning rate of Adam."""
     muon_rate: float = 0.03
@@ -102,6 +110,12 @@ class OptimConfig:
     """Latents of a step for the head's targets."""
     consistency_batch: int = 24
     """Latents of a step for f(g(z); z)^2."""
+    refine_rounds: int = 1
+    """Rounds of the last stage, in which the head learns the level set of the finished f."""
+    refine_latents: int = 6000
+    """Latents in between at which it does."""
+    refine_steps: int = 3500
+    """Optimiser steps of each round."""
     seed: int = 0
     """Seed of every random draw."""
     threads: int = 2
@@ -109,11 +123,25 @@ class OptimConfig:
 
 
 @dataclass(frozen=True)
+class CheckConfig:
+    """How the finished prior is checked."""
+
+    mask_cells: int = 64
+    """Cells along each side of the mask of valid latents (two dimensions)."""
+    judged: int = 16000
+    """Draws of the mixture from which validity is learned (more dimensions)."""
+    draws: int = 2000
+    """Draws of the finished prior that are decoded for its card."""
+
+
+@dataclass(frozen=True)
 class TrainingConfig:
     """One prior."""
 
     name: str = "prior"
-    """Folder of the checkpoint below `checkpoints`."""
+    """Name of the prior and of its checkpoint folder."""
+    unseen_from: str = ""
+    """Prior of the same recipe with objects left out, whose unseen errors the card quotes."""
     data: DataConfig = field(default_factory=DataConfig)
     """Which outlines."""
     layout: LayoutConfig = field(default_factory=LayoutConfig)
@@ -122,3 +150,5 @@ class TrainingConfig:
     """Which networks."""
     optim: OptimConfig = field(default_factory=OptimConfig)
     """How they learn."""
+    check: CheckConfig = field(default_factory=CheckConfig)
+    """How the result is checked."""

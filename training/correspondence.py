@@ -30,10 +30,10 @@ class MeasuredCurve:
 
     points: Float64[np.ndarray, "n 2"]
     """Dense points [m], counter-clockwise."""
-    measure: Float64[np.ndarray, "m"]
+    measure: Float64[np.ndarray, " m"]
     """Cumulative measure at the points and, last, back at the start (m = n + 1)."""
 
-    def at(self, positions: Float64[np.ndarray, "p"]) -> Float64[np.ndarray, "p 2"]:
+    def at(self, positions: Float64[np.ndarray, " p"]) -> Float64[np.ndarray, "p 2"]:
         """Points at the given measures, taken modulo 1 [m]."""
         closed = np.vstack((self.points, self.points[:1]))
         wrapped = np.mod(positions, 1.0)
@@ -81,7 +81,7 @@ def measure(vertices: Float64[np.ndarray, "_ 2"], turning_share: float) -> Measu
     return MeasuredCurve(dense, np.concatenate(([0.0], np.cumsum(rate))))
 
 
-def _align(curves: list[MeasuredCurve]) -> Float64[np.ndarray, "n"]:
+def _align(curves: list[MeasuredCurve]) -> Float64[np.ndarray, " n"]:
     """Start of each curve, as a share of it, that agrees best with the mean of all."""
     grid = np.arange(ALIGNING) / ALIGNING
     sampled = np.stack([c.at(grid) @ np.array([1.0, 1j]) for c in curves])

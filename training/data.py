@@ -23,6 +23,7 @@ from tpcd.shape.levelset import HALF_WIDTH
 from training.config import TrainingConfig
 from training.correspondence import correspond
 from training.layout import make_layout
+from training.mixture import Mixture
 from training.outlines import data_hash, training_outlines
 from training.polygons import Samples, sample_around
 
@@ -37,15 +38,16 @@ class Prepared:
     data_hash: str
     codes: Float[Tensor, "n z"]
     """Initial codes."""
-    border: Float[Tensor, "b z"]
-    """Fixed border nodes."""
-    between: Float[Tensor, "m k"]
-    """Latents in between as weights on codes and border nodes (k = n + b)."""
+    weights: Float[Tensor, "m n"]
+    """Latents in between are weights @ codes + offsets."""
+    offsets: Float[Tensor, "m z"]
+    mixture: Mixture | None
+    """Density of the latents; None where it is uniform."""
     targets: Float[Tensor, "n p 2"]
     """Head targets of the outlines, in units of `UNIT`."""
     morphs: Float[Tensor, "m p 2"]
     """Head targets in between."""
-    simple: Bool[Tensor, "m"]
+    simple: Bool[Tensor, " m"]
     """Whether a morph does not cross itself; the others teach nothing."""
     object_samples: Samples
     between_samples: Samples
@@ -73,8 +75,9 @@ def prepare(config: TrainingConfig) -> Prepared:
         vertices=tuple(vertices),
         data_hash=data_hash(outlines),
         codes=_float(layout.codes),
-        border=_float(layout.border),
-        between=_float(layout.between),
+        weights=_float(layout.weights),
+        offsets=_float(layout.offsets),
+        mixture=layout.mixture,
         targets=targets,
         morphs=morphs,
         simple=simple,
@@ -90,12 +93,12 @@ def prepare(config: TrainingConfig) -> Prepared:
 class Batch(NamedTuple):
     """Random indices of one step."""
 
-    outline: Int[Tensor, "s"]
-    outline_sample: Int[Tensor, "s"]
-    between: Int[Tensor, "s"]
-    between_sample: Int[Tensor, "s"]
-    head: Int[Tensor, "h"]
-    consistency: Int[Tensor, "c"]
+    outline: Int[Tensor, " s"]
+    outline_sample: Int[Tensor, " s"]
+    between: Int[Tensor, " s"]
+    between_sample: Int[Tensor, " s"]
+    head: Int[Tensor, " h"]
+    consistency: Int[Tensor, " c"]
 
 
 class _Draws(IterableDataset):
@@ -110,7 +113,8 @@ class _Draws(IterableDataset):
     def __iter__(self) -> Iterator[Batch]:
         data, optim = self.prepared, self.config.optim
         generator = torch.Generator().manual_seed(optim.seed + 1)
-        half = optim.batch // 2
+        between = int(optim.between_share * optim.batch)
+        own = optim.batch - between
         outlines, per_outline = data.object_samples.distance.shape
         latents, per_latent = data.between_samples.distance.shape
 
@@ -119,10 +123,10 @@ class _Draws(IterableDataset):
 
         for _ in range(len(self)):
             yield Batch(
-                draw(outlines, half),
-                draw(per_outline, half),
-                draw(latents, half),
-                draw(per_latent, half),
+                draw(outlines, own),
+                draw(per_outline, own),
+                draw(latents, between),
+                draw(per_latent, between),
                 draw(latents, optim.head_batch),
                 draw(latents, optim.consistency_batch),
             )

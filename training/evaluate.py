@@ -52,8 +52,8 @@ def uniform_points(
 
 
 def outline_errors(
-    shape: DeepSDFShape, latent: Float[Tensor, "z"], vertices: Float64[np.ndarray, "_ 2"]
-) -> dict[str, Float64[np.ndarray, "_"]]:
+    shape: DeepSDFShape, latent: Float[Tensor, " z"], vertices: Float64[np.ndarray, "_ 2"]
+) -> dict[str, Float64[np.ndarray, " _"]]:
     """Errors of one decoded outline at a true one, along the true outline [mm].
 
     `level_set`: distance of 1000 true points from the traced zero level set; `head`: their
@@ -72,8 +72,8 @@ def outline_errors(
 
 
 def eikonal_errors(
-    shape: DeepSDFShape, latent: Float[Tensor, "z"], vertices: Float64[np.ndarray, "_ 2"]
-) -> Float64[np.ndarray, "_"]:
+    shape: DeepSDFShape, latent: Float[Tensor, " z"], vertices: Float64[np.ndarray, "_ 2"]
+) -> Float64[np.ndarray, " _"]:
     """| |grad f| - 1 | at 1000 points spread over a band of 3 mm about the outline."""
     true = uniform_points(vertices)
     edges = np.roll(true, -1, axis=0) - np.roll(true, 1, axis=0)
@@ -98,7 +98,7 @@ def head_distances(
 
 def support_errors(
     shape: DeepSDFShape, latents: Float[Tensor, "count z"]
-) -> Float64[np.ndarray, "count"]:
+) -> Float64[np.ndarray, " count"]:
     """Largest difference, over directions, of the head's support from the level set's [mm].
 
     The level set is traced at 2 mm and its vertices brought onto f = 0 by Newton steps.
@@ -142,13 +142,14 @@ def measure_prior(
         for key, value in errors.items():
             pooled.setdefault(key, []).append(value)
     latents = shape.sample_latent(draws, torch.Generator().manual_seed(seed))
-    support = support_errors(shape, latents[:300])
+    support = support_errors(shape, latents[: min(300, draws // 4)])
     summary = {key: vars(Spread.of(np.concatenate(value))) for key, value in pooled.items()}
     return {
         "training_errors_mm": summary,
         "training_errors_by_outline_mean_p95_max": per_outline,
         "head_to_level_set_mm": vars(Spread.of(head_distances(shape, latents))),
         "support_error_mm": vars(Spread.of(support[np.isfinite(support)])),
+        "support_error_is": "largest over 180 directions, for each latent",
         "valid_share": plausible_share(shape, latents),
         "valid_draws": draws,
     }

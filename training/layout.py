@@ -5,7 +5,9 @@ get neighbouring sites. The square is triangulated; every latent is a convex com
 the three nodes of its triangle, and its outline the same combination of their outlines.
 Border nodes (fixed) repeat the outline of the nearest point of the codes' hull, so that the
 whole square is taken care of. More dimensions: codes start at the scaled principal
-components, and the latents in between are random convex combinations of near codes.
+components; the outline of any latent is the linear model's plus the residuals of the codes
+around it, weighted by a kernel; latents in between come from convex combinations of near
+codes and from the Gaussian mixture fitted to those, which becomes the prior density.
 """
 
 from __future__ import annotations
@@ -13,31 +15,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from jaxtyping import Float64
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import Delaunay
 
 from training.config import LayoutConfig
+from training.mixture import Mixture, fit_mixture
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Nodes of the latent space and random latents between them, as weights on the nodes."""
+    """Initial codes and random latents between them, with the outlines these should have."""
 
     codes: Float64[np.ndarray, "n z"]
     """Initial codes of the n outlines."""
-    border: Float64[np.ndarray, "b z"]
-    """Fixed further nodes; none when z > 2."""
-    border_weights: Float64[np.ndarray, "b n"]
-    """Outline of each border node as a convex combination of the n outlines."""
-    between: Float64[np.ndarray, "m k"]
-    """Latents in between as convex combinations of the k = n + b nodes."""
-
-    @property
-    def outline_weights(self) -> Float64[np.ndarray, "m n"]:
-        """Outlines of the latents in between as combinations of the n outlines."""
-        n = len(self.codes)
-        return self.between[:, :n] + self.between[:, n:] @ self.border_weights
+    weights: Float64[np.ndarray, "m n"]
+    """Latent k in between is weights[k] @ codes + offsets[k], so it follows the codes."""
+    offsets: Float64[np.ndarray, "m z"]
+    outline_weights: Float64[np.ndarray, "m n"]
+    """Outlines of the latents in between as combinations of the n outlines."""
+    mixture: Mixture | None = None
+    """Density of the latents, before truncation; None where it is uniform (z = 2)."""
 
 
 def make_layout(
@@ -69,7 +68,10 @@ def _square_layout(
     weights = np.column_stack((first, 1 - first.sum(axis=1)))
     between = np.zeros((config.between, len(nodes)))
     np.put_along_axis(between, triangles.simplices[simplex], weights, axis=1)
-    return Layout(codes, border, border_weights, between)
+    own, fixed = between[:, : len(codes)], between[:, len(codes) :]
+    # A smoother (Clough-Tocher) interpolation was tried: it overshoots, and a quarter of the
+    # outlines in between then cross themselves, against 4 % of these.
+    return Layout(codes, own, fixed @ border, own + fixed @ border_weights)
 
 
 def _neighbourly_sites(
@@ -136,7 +138,7 @@ def _swap_to_neighbours(
 
 def _hull_projection(
     node: np.ndarray, codes: np.ndarray, hull: np.ndarray
-) -> Float64[np.ndarray, "n"]:
+) -> Float64[np.ndarray, " n"]:
     """Weights on the codes of the point of their hull's boundary that is nearest to `node`."""
     starts, ends = codes[hull[:, 0]], codes[hull[:, 1]]
     edges = ends - starts
@@ -155,17 +157,50 @@ def _component_layout(
     config: LayoutConfig,
     rng: np.random.Generator,
 ) -> Layout:
-    flat = outlines.reshape(len(outlines), -1)
-    components = _principal_components(flat, latent_dim)
-    # One common scale keeps distances between codes proportional to those of outlines.
-    codes = components / np.abs(components).max() * config.extent
-    distance = np.linalg.norm(codes[:, None] - codes[None], axis=-1)
-    near = distance.argsort(axis=1)[:, : config.neighbours + 1]
-    between = np.zeros((config.between, len(codes)))
-    for row in between:
-        chosen = rng.choice(near[rng.integers(len(codes))], size=3, replace=False)
-        row[chosen] = rng.dirichlet(np.ones(3))
-    return Layout(codes, np.zeros((0, latent_dim)), np.zeros((0, len(codes))), between)
+    n = len(outlines)
+    flat = outlines.reshape(n, -1)
+    left, values, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+    components = left[:, :latent_dim] * values[:latent_dim]
+    scale = np.abs(components).max(axis=0) / config.extent
+    codes = components / scale
+    distance = np.linalg.norm(components[:, None] - components[None], axis=-1)
+    order = distance.argsort(axis=1)
+    bandwidth = float(np.median(np.take_along_axis(distance, order[:, 3:4], axis=1)))
+    # The linear model mean + c V is itself a combination of the outlines: 1/n + U S^-1 c.
+    to_linear = (left[:, :latent_dim] / values[:latent_dim]).T
+    linear_at_codes = 1 / n + components @ to_linear
+
+    def weights_at(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Kernel weights of the codes, and weights of the outlines, at latents."""
+        c = latents * scale
+        square = np.square(c[:, None] - components[None]).sum(-1)
+        kernel = np.exp(-0.5 * square / bandwidth**2)
+        kernel /= kernel.sum(axis=1, keepdims=True) + np.exp(-2)
+        return kernel, 1 / n + c @ to_linear + kernel @ (np.eye(n) - linear_at_codes)
+
+    seeds = _near_combinations(codes, order[:, : config.neighbours + 1], config, rng)
+    outline_weights = weights_at(seeds)[1]
+    simple = shapely.is_valid(shapely.polygons((outline_weights @ flat).reshape(len(seeds), -1, 2)))
+    mixture = fit_mixture(seeds[simple], config.components, rng)
+    drawn = mixture.draw(config.between - len(seeds), rng)
+    latents = np.vstack((seeds, drawn)).clip(-1, 1)
+    weights, outline_weights = weights_at(latents)
+    return Layout(codes, weights, latents - weights @ codes, outline_weights, mixture)
+
+
+def _near_combinations(
+    codes: Float64[np.ndarray, "n z"],
+    near: np.ndarray,
+    config: LayoutConfig,
+    rng: np.random.Generator,
+) -> Float64[np.ndarray, "m z"]:
+    """Random convex combinations of three near codes each, with a little noise."""
+    count = config.between // 2
+    chosen = np.stack([rng.permutation(near[rng.integers(len(codes))])[:3] for _ in range(count)])
+    # Shares concentrate on one code (Dirichlet 1/2), so that lone codes are not forgotten.
+    shares = rng.dirichlet(np.full(3, 0.5), count)
+    noise = config.jitter * codes.std(axis=0) * rng.standard_normal((count, codes.shape[1]))
+    return (np.einsum("mk,mkz->mz", shares, codes[chosen]) + noise).clip(-1, 1)
 
 
 def _principal_components(

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from tpcd.shape.deepsdf import UNIT, Architecture, DeepSDFNetwork
 from training.config import TrainingConfig
 from training.data import Batch, Prepared
+from training.rates import cosine_rate, split_optimizers
 
 NEAR = 0.03
 """Distance up to which the gradient of f counts fully [m]."""
@@ -26,8 +27,6 @@ FAR_WEIGHT = 0.3
 """What it counts further away, where it keeps f from spurious level sets."""
 SOFTENING = 0.005
 """Errors count in proportion to 1 / (distance + this) [m]."""
-WARM_UP = 50
-"""Steps over which the learning rates rise."""
 
 
 class PriorModule(LightningModule):
@@ -41,7 +40,7 @@ class PriorModule(LightningModule):
 
     def between_latents(self) -> Float[Tensor, "m z"]:
         """Current latents in between; they follow the codes."""
-        return self.data.between @ torch.cat((self.network.codes, self.data.border))
+        return self.data.weights @ self.network.codes + self.data.offsets
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """One step of both optimisers."""
@@ -63,8 +62,8 @@ class PriorModule(LightningModule):
     def loss_terms(self, batch: Batch, consistent: bool) -> dict[str, Tensor]:
         """Weighted terms of the loss; `consistent` adds f(g(z); z)^2."""
         data, optim, network = self.data, self.config.optim, self.network
-        nodes = torch.cat((network.codes, data.border))
-        terms = self._distance_terms(batch, data.between[batch.between] @ nodes)
+        latents = data.weights[batch.between] @ network.codes + data.offsets[batch.between]
+        terms = self._distance_terms(batch, latents)
         # The head learns where the latents are; it does not move them.
         latents, codes = self.between_latents().detach(), network.codes.detach()
         simple = data.simple[batch.head].float()
@@ -106,31 +105,20 @@ class PriorModule(LightningModule):
         }
 
     def configure_optimizers(self) -> tuple[list, list]:
-        """Muon for square-ish hidden matrices, Adam for first layers, biases and codes."""
+        """Adam and Muon, see `rates`; the schedules are stepped with them."""
         optim = self.config.optim
-        hidden = [
-            layer.weight
-            for mlp in (self.network.sdf[2:-1], self.network.head[2:])
-            for layer in mlp
-            if isinstance(layer, nn.Linear)
+        optimizers = split_optimizers(
+            [self.network.sdf, self.network.head],
+            [self.network.codes],
+            optim.adam_rate,
+            optim.muon_rate,
+            optim.code_rate,
+        )
+        schedulers = [
+            torch.optim.lr_scheduler.LambdaLR(o, lambda k: cosine_rate(k, optim.steps))
+            for o in optimizers
         ]
-        taken = {id(weight) for weight in hidden} | {id(self.network.codes)}
-        others = [p for p in self.network.parameters() if id(p) not in taken]
-        groups = [
-            {"params": others, "lr": optim.adam_rate},
-            {"params": [self.network.codes], "lr": optim.code_rate},
-        ]
-        optimizers = [
-            torch.optim.Adam(groups, betas=(0.9, 0.99)),
-            torch.optim.Muon(hidden, lr=optim.muon_rate, momentum=0.95, weight_decay=0.0),
-        ]
-        schedulers = [torch.optim.lr_scheduler.LambdaLR(o, self._rate) for o in optimizers]
         return optimizers, schedulers
-
-    def _rate(self, step: int) -> float:
-        """Linear warm-up, then half a cosine down to 0.2 %."""
-        done = min(step / self.config.optim.steps, 1.0)
-        return min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * done)) + 0.002
 
 
 def initial_network(prepared: Prepared, config: TrainingConfig) -> DeepSDFNetwork:
@@ -143,6 +131,7 @@ def initial_network(prepared: Prepared, config: TrainingConfig) -> DeepSDFNetwor
         head_width=sizes.head_width,
         head_depth=sizes.head_depth,
         points=config.layout.points,
+        disc_radius=sizes.disc_radius,
     )
     network = DeepSDFNetwork(architecture, len(prepared.names))
     generator = torch.Generator().manual_seed(config.optim.seed)

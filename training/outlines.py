@@ -34,6 +34,11 @@ def training_outlines(
     else:
         found = {name: v for name, v in found.items() if suitable(v, config)}
     if config.only:
+        unknown = sorted(set(config.only) - set(found))
+        if unknown:
+            raise ValueError(
+                f"data.only names {', '.join(unknown)}, expected names among {', '.join(found)}"
+            )
         found = {name: found[name] for name in config.only}
     found = {n: v for n, v in found.items() if not n.startswith(tuple(config.leave_out))}
     for outline in random_outlines(config.builtin_variants, rng):

@@ -80,8 +80,7 @@ def sample_around(
     # 4 million point-edge pairs at a time keep the scratch memory below 200 MB.
     block = max(1, 4_000_000 // (count * polygons.shape[1]))
     pieces = [
-        signed_distance(points[i : i + block], polygons[i : i + block])
-        for i in range(0, n, block)
+        signed_distance(points[i : i + block], polygons[i : i + block]) for i in range(0, n, block)
     ]
     distance, gradient = (torch.cat(piece) for piece in zip(*pieces, strict=True))
     return Samples(points, distance, gradient)

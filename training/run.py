@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import platform
 import time
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import torch
 import yaml
 from lightning import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils.tensorboard import SummaryWriter
 
 from tpcd.errors import RunError
 from tpcd.shape.checkpoint import load_prior, save_prior
+from tpcd.shape.deepsdf import DeepSDFNetwork
 from training.config import TrainingConfig
 from training.data import Prepared, PriorData, prepare
 from training.evaluate import measure_prior
 from training.module import PriorModule
-from training.validity import fit_mask
+from training.monitor import ErrorMonitor, log_figures
+from training.refine import refine_head
+from training.unseen import measure_unseen, unseen_outlines
+from training.validity import fit_mask, fit_truncated_mixture
 
 PACKAGES = ("torch", "lightning", "numpy", "scipy", "shapely", "contourpy", "safetensors")
 ATTRIBUTION = (
@@ -36,58 +44,114 @@ def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False)
     Raises:
         RunError: `resume` without anything to resume from.
         FileError: the outlines are not there.
+        TrainingError: the trained networks decode to nothing.
     """
     last = out / "last.ckpt"
     if resume and not last.is_file():
         raise RunError(out, "holds no last.ckpt to resume from", "leave out --resume")
     torch.set_num_threads(config.optim.threads)
-    torch.manual_seed(config.optim.seed)
     began = time.process_time()
     prepared = prepare(config)
     out.mkdir(parents=True, exist_ok=True)
     resolved = yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
     (out / "config.yaml").write_text(resolved, encoding="utf-8")
     module = PriorModule(prepared, config)
+    _fit(module, prepared, config, out, last if resume else None)
+    refine_head(module.network, _simple_latents(module), config.optim)
+    seconds = time.process_time() - began
+    export_prior(module.network.eval().requires_grad_(False), prepared, config, export, seconds)
+    outlines = dict(zip(prepared.names, prepared.vertices, strict=True))
+    return complete_card(export, outlines, config, out)
+
+
+def export_prior(
+    network: DeepSDFNetwork,
+    prepared: Prepared,
+    config: TrainingConfig,
+    folder: Path,
+    seconds: float,
+) -> Path:
+    """Find the valid region and write the prior, not measured yet."""
+    density = (
+        fit_mask(network, config.check.mask_cells)
+        if prepared.mixture is None
+        else fit_truncated_mixture(
+            network, prepared.mixture, config.optim.seed, config.check.judged
+        )
+    )
+    card: dict[str, object] = {
+        "created": time.strftime("%Y-%m-%d"),
+        "data_sha256": prepared.data_hash,
+        "licence": "MIT; outlines made in code" if config.data.source == "builtin" else ATTRIBUTION,
+        "training_cpu_seconds": round(seconds, 1),
+        "threads": config.optim.threads,
+        "configuration": dataclasses.asdict(config),
+        "versions": {"python": platform.python_version()} | {p: version(p) for p in PACKAGES},
+    }
+    return save_prior(folder, network, density, prepared.names, 0.0, card)
+
+
+def complete_card(
+    folder: Path, outlines: dict[str, np.ndarray], config: TrainingConfig, out: Path
+) -> Path:
+    """Measure a prior as it is loaded from `folder`, write its card and figures again.
+
+    A prior that has seen every object quotes the unseen errors of `config.unseen_from`, the
+    same recipe trained with objects left out.
+    """
+    shape = load_prior(folder)
+    card = dict(shape.card) | measure_prior(shape, outlines, config.check.draws)
+    misfit_sd = shape.misfit_sd
+    strangers = unseen_outlines(shape.names, config.data)
+    if config.unseen_from:
+        other = load_prior(config.unseen_from)
+        card["unseen"] = {"measured_with": config.unseen_from, **other.card["unseen"]}
+        misfit_sd = other.misfit_sd
+    elif strangers:
+        report = measure_unseen(shape, strangers)
+        card["unseen"] = report.figures
+        misfit_sd = report.misfit_sd
+    card["misfit_sd_m"] = misfit_sd
+    save_prior(folder, shape.network, shape.density, shape.names, misfit_sd, card)
+    by_outline = card["training_errors_by_outline_mean_p95_max"]
+    errors = {name: figures["level_set"][0] for name, figures in by_outline.items()}
+    with SummaryWriter(str(out / "tensorboard")) as writer:
+        log_figures(shape, outlines, errors, writer, out, config.optim.steps)
+    return folder
+
+
+def _fit(
+    module: PriorModule, prepared: Prepared, config: TrainingConfig, out: Path, resume: Path | None
+) -> None:
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    # Lightning warns of our one-process loader and of a folder that a resumed run reuses.
+    warnings.filterwarnings("ignore", category=UserWarning, module="lightning")
+    warnings.filterwarnings("ignore", category=FutureWarning, module="lightning")
+    keep = ModelCheckpoint(
+        dirpath=out, filename="last", every_n_train_steps=200, enable_version_counter=False
+    )
     trainer = Trainer(
         accelerator="cpu",
         max_epochs=1,
         logger=TensorBoardLogger(str(out), name="", version="tensorboard"),
         callbacks=[
-            ModelCheckpoint(
-                dirpath=out, filename="last", every_n_train_steps=500, enable_version_counter=False
-            )
+            keep,
+            TQDMProgressBar(refresh_rate=20),
+            ErrorMonitor(prepared, config.optim.steps),
         ],
         enable_model_summary=False,
         log_every_n_steps=20,
     )
-    data = PriorData(prepared, config)
-    # The checkpoint was written by this program into its own run folder.
-    trainer.fit(module, data, ckpt_path=str(last) if resume else None, weights_only=False)
-    training_seconds = time.process_time() - began
-    return export_prior(module.network, prepared, config, export, training_seconds)
+    trainer.fit(
+        module,
+        PriorData(prepared, config),
+        ckpt_path=str(resume) if resume else None,
+        weights_only=True,
+    )
 
 
-def export_prior(
-    network: torch.nn.Module,
-    prepared: Prepared,
-    config: TrainingConfig,
-    folder: Path,
-    training_seconds: float,
-    misfit_sd: float = 0.0,
-) -> Path:
-    """Find the valid region, write the prior, measure it as loaded, complete its card."""
-    network = network.eval().requires_grad_(False)
-    density = fit_mask(network)
-    card: dict[str, object] = {
-        "created": time.strftime("%Y-%m-%d"),
-        "data_sha256": prepared.data_hash,
-        "licence": ATTRIBUTION if config.data.source != "builtin" else "made in code",
-        "training_cpu_seconds": round(training_seconds, 1),
-        "threads": config.optim.threads,
-        "configuration": dataclasses.asdict(config),
-        "versions": {"python": platform.python_version()} | {p: version(p) for p in PACKAGES},
-    }
-    save_prior(folder, network, density, prepared.names, misfit_sd, card)
-    outlines = dict(zip(prepared.names, prepared.vertices, strict=True))
-    card |= measure_prior(load_prior(folder), outlines)
-    return save_prior(folder, network, density, prepared.names, misfit_sd, card)
+def _simple_latents(module: PriorModule) -> torch.Tensor:
+    """Latents in between whose target does not cross itself, shuffled."""
+    latents = module.between_latents().detach()[module.data.simple]
+    generator = torch.Generator().manual_seed(module.config.optim.seed)
+    return latents[torch.randperm(len(latents), generator=generator)]

@@ -27,10 +27,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--resume", action="store_true", help="go on from OUT's last checkpoint")
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
-    options = parser.instantiate_classes(parser.parse_args(arguments))
-    config = TrainingConfig(
-        **{name: options[name] for name in TrainingConfig.__dataclass_fields__}
-    )
+    options = parser.instantiate(parser.parse_args(arguments))
+    config = TrainingConfig(**{name: options[name] for name in TrainingConfig.__dataclass_fields__})
     out = Path(options.out or Path("runs") / config.name)
     # torch and Lightning take seconds to import; --help should not wait for them.
     from training.run import train
@@ -39,11 +37,11 @@ def main(arguments: list[str] | None = None) -> int:
         began = time.process_time()
         folder = train(config, out, Path(options.export or out / config.name), options.resume)
         print(f"prior written to {folder} ({time.process_time() - began:.0f} CPU s in all)")
-    except TpcdError as error:
+    except (TpcdError, ValueError) as error:
         if options.debug:
             raise
         print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+        return getattr(error, "exit_code", 2)
     return 0
 
 

@@ -58,6 +58,9 @@ class Architecture:
     """Hidden layers of the outline head."""
     points: int = 128
     """Outline points p that the head gives."""
+    disc_radius: float = 0.0
+    """If positive, f is the distance to a disc of this radius [m] plus what the network
+    adds: right far away before any training, so that no stray level sets appear there."""
 
 
 class DeepSDFNetwork(nn.Module):
@@ -80,7 +83,12 @@ class DeepSDFNetwork(nn.Module):
         first = self.sdf[0]
         from_points = points @ first.weight[:, :2].mT
         from_latent = latent @ first.weight[:, 2:].mT + first.bias
-        return self.sdf[1:](from_points + from_latent[..., None, :])[..., 0]
+        learned = self.sdf[1:](from_points + from_latent[..., None, :])[..., 0]
+        if self.architecture.disc_radius <= 0:
+            return learned
+        # The root is softened by 5 mm: the distance to a point has a kink there.
+        radius = (points.square().sum(-1) + (0.005 / UNIT) ** 2).sqrt()
+        return radius - self.architecture.disc_radius / UNIT + learned
 
     def outline(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch p 2"]:
         """Outline points g(z) in units of `UNIT`."""
@@ -118,7 +126,7 @@ class DeepSDFShape:
         """Latents of the training outlines, float64."""
         return self.network.codes.detach().double()
 
-    def code_of(self, name: str) -> Float[Tensor, "z"]:
+    def code_of(self, name: str) -> Float[Tensor, " z"]:
         """Latent of one training outline, float64; KeyError names those that exist."""
         if name not in self.names:
             raise KeyError(f"no training outline '{name}'; there are {', '.join(self.names)}")

@@ -43,7 +43,10 @@ class LevelSet:
 
 
 def decode(
-    shape: Shape, latent: Float[Tensor, "z"], spacing: float = 0.002, half_width: float = HALF_WIDTH
+    shape: Shape,
+    latent: Float[Tensor, " z"],
+    spacing: float = 0.002,
+    half_width: float = HALF_WIDTH,
 ) -> LevelSet:
     """Zero level set of one latent on a grid of `spacing` [m] over a centred square."""
     return next(decode_many(shape, latent[None], spacing, half_width))
@@ -68,7 +71,7 @@ def decode_many(
 
 
 def _near_zero_values(
-    shape: Shape, latent: Float[Tensor, "z"], grid: Float[Tensor, "n n 2"]
+    shape: Shape, latent: Float[Tensor, " z"], grid: Float[Tensor, "n n 2"]
 ) -> Float[Tensor, "n n"]:
     """Signed distances on a grid: exact near the zero level set, elsewhere of the right sign.
 

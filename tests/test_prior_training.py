@@ -1,0 +1,154 @@
+"""Training runs end to end on three built-in outlines and learns their shapes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
+from training.config import DataConfig, OptimConfig, TrainingConfig
+from training.evaluate import outline_errors
+from training.outlines import data_hash, mirrored, suitable, training_outlines
+from training.rates import cosine_rate, split_optimizers
+from training.train import main
+
+CONFIGS = Path(__file__).resolve().parents[1] / "training" / "configs"
+NAMES = ("drink_can", "banana", "juice_carton")
+ARGUMENTS = [
+    f"--config={CONFIGS / 'builtin-z2.yaml'}",
+    f"--data.only=[{','.join(NAMES)}]",
+    "--layout.between=300",
+    "--layout.object_samples=1000",
+    "--layout.between_samples=60",
+    "--layout.attempts=1",
+    "--network.sdf_width=64",
+    "--network.sdf_depth=3",
+    "--network.head_width=64",
+    "--network.head_frequency=3",
+    "--optim.batch=768",
+    "--optim.refine_steps=150",
+    "--optim.refine_latents=200",
+    "--optim.head_batch=64",
+    "--optim.threads=1",
+    "--check.mask_cells=10",
+    "--check.draws=60",
+]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run")
+    assert main([*ARGUMENTS, "--optim.steps=250", f"--out={out}"]) == 0
+    return out
+
+
+def test_the_prior_learns_its_outlines(run: Path) -> None:
+    shape = load_prior(run / "builtin-z2")
+    assert set(shape.names) == set(NAMES)
+    for name in NAMES:
+        errors = outline_errors(shape, shape.code_of(name), builtin_outlines()[name].vertices)
+        assert errors["level_set"].mean() < 0.8
+        assert errors["head"].mean() < 1.5
+
+
+def test_the_card_tells_what_was_done(run: Path) -> None:
+    card = json.loads((run / "builtin-z2" / "card.json").read_text())
+    assert card["outlines"] == [n for n in builtin_outlines() if n in NAMES]
+    assert card["configuration"]["optim"]["steps"] == 250
+    assert card["training_errors_mm"]["level_set"]["mean"] < 0.8
+    assert card["valid_share"] > 0.8
+    assert {"torch", "numpy", "python"} <= set(card["versions"])
+    outlines = training_outlines(DataConfig("builtin", only=list(NAMES)), np.random.default_rng(0))
+    assert card["data_sha256"] == data_hash(outlines)
+
+
+def test_figures_and_tensorboard_are_written(run: Path) -> None:
+    for name in ("outlines", "latent_map", "worst"):
+        assert (run / f"{name}.png").stat().st_size > 10_000
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    scalars: set[str] = set()
+    for file in (run / "tensorboard").glob("events*"):
+        events = EventAccumulator(str(file))
+        events.Reload()
+        scalars |= set(events.Tags()["scalars"]) | set(events.Tags()["images"])
+    wanted = {"loss", "loss/distance", "outlines", "latent_map", "worst"}
+    assert wanted | {f"error_mm/{name}" for name in NAMES} <= scalars
+
+
+def test_a_run_resumes_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # The last Lightning checkpoint of 250 steps was written at step 200.
+    saved = torch.load(run / "last.ckpt", weights_only=True)
+    assert saved["global_step"] > 0
+    assert main([*ARGUMENTS, "--optim.steps=260", f"--out={run}", "--resume"]) == 0
+    assert load_prior(run / "builtin-z2").card["configuration"]["optim"]["steps"] == 260
+
+
+def test_resuming_from_nothing_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*ARGUMENTS, f"--out={tmp_path}", "--resume"]) == 2
+    message = capsys.readouterr().err.strip()
+    assert "last.ckpt" in message
+    assert "\n" not in message
+
+
+def test_unknown_outlines_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--data.source=builtin", "--data.only=[teapot]", f"--out={tmp_path / 'x'}"]
+    assert main(arguments) == 2
+    assert "teapot" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_configuration_parses(path: Path) -> None:
+    from training.measure import config_of
+
+    saved = yaml.safe_load(path.read_text())
+    config = config_of(saved)
+    assert isinstance(config, TrainingConfig)
+    assert config.name == path.stem
+
+
+def test_leaving_out_an_object_leaves_out_its_views_and_mirror_images() -> None:
+    config = DataConfig("builtin", mirror=True, leave_out=["mug"], builtin_variants=5)
+    found = training_outlines(config, np.random.default_rng(0))
+    assert not any(name.startswith("mug") for name in found)
+    assert {"banana", "banana/mirrored"} <= set(found)
+    assert any(name.startswith("builtin/") for name in found)
+    assert all(suitable(vertices, config) for vertices in found.values())
+
+
+def test_a_mirrored_outline_is_counter_clockwise() -> None:
+    vertices = builtin_outlines()["mug"].vertices
+    after = np.roll(mirrored(vertices), -1, axis=0)
+    area = 0.5 * np.sum(
+        mirrored(vertices)[:, 0] * after[:, 1] - mirrored(vertices)[:, 1] * after[:, 0]
+    )
+    assert area > 0
+    np.testing.assert_array_equal(mirrored(mirrored(vertices)), vertices)
+
+
+def test_the_learning_rate_rises_and_falls() -> None:
+    rates = [cosine_rate(step, 1000) for step in range(1000)]
+    assert rates[0] < 0.03
+    assert max(rates) == pytest.approx(1.0, abs=0.02)
+    assert rates[-1] < 0.01
+
+
+def test_every_weight_has_exactly_one_optimiser() -> None:
+    from tpcd.shape.deepsdf import Architecture, DeepSDFNetwork
+
+    network = DeepSDFNetwork(Architecture(2), 3)
+    optimizers = split_optimizers([network.sdf, network.head], [network.codes], 1, 1, 1)
+    held = [id(p) for o in optimizers for g in o.param_groups for p in g["params"]]
+    assert sorted(held) == sorted(id(p) for p in network.parameters())
+    assert OptimConfig().steps > 0

@@ -1,0 +1,106 @@
+"""Best fit of a prior to an outline it has not seen, as an estimator could find it.
+
+Unknown are the latent and, as in the estimation problem, a scale in [0.8, 1.2] and a mount
+(20 mm, 0.2 rad) within which the outline may sit. Minimised is the mean distance from the
+true outline to the head's polygon plus the mean difference of the support functions (what
+contact with flat surroundings feels), by Adam from several starts at once; only valid
+latents count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from tpcd.planar import transform_points
+from tpcd.shape.deepsdf import DeepSDFShape
+from training.evaluate import MM, uniform_points
+
+STARTS, STEPS = 6, 150
+REACH = (0.2, 0.02, 0.02, 0.2)
+"""Half-ranges of scale, mount x, mount z [m] and mount angle [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best outline of a family for a true one."""
+
+    latent: Tensor
+    """Best latent (z)."""
+    errors_mm: Float64[np.ndarray, " p"]
+    """Distance of points along the true outline from the fitted polygon [mm]."""
+    hull_errors_mm: Float64[np.ndarray, " k"]
+    """Difference of the support functions in 180 directions [mm]: what contact feels."""
+
+
+def best_fit(
+    shape: DeepSDFShape,
+    vertices: Float64[np.ndarray, "_ 2"],
+    generator: torch.Generator,
+    scene: bool = True,
+) -> Fit:
+    """Fit latent and, with `scene`, scale and mount to an outline [m]."""
+    true = torch.from_numpy(uniform_points(vertices, 240)).float()
+    draws = torch.cat((shape.sample_latent(400, generator), shape.codes)).float()
+    size = shape.boundary_points(draws).detach()
+    extent = size.amax(1) - size.amin(1)
+    wanted = torch.from_numpy(np.ptp(vertices, axis=0)).float()
+    nearest = (extent - wanted).abs().sum(-1).topk(40, largest=False).indices
+    outlines = size[nearest]
+    rough = torch.cdist(true[None].expand(len(nearest), -1, -1), outlines).amin(-1).mean(-1)
+    start = draws[nearest[rough.topk(STARTS, largest=False).indices]]
+    latent = start.clone().requires_grad_()
+    free = torch.zeros(STARTS, 4, requires_grad=True)
+    optimizer = torch.optim.Adam([{"params": [latent], "lr": 0.03}, {"params": [free], "lr": 0.05}])
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    best = torch.full((STARTS,), torch.inf)
+    kept = (latent.detach().clone(), free.detach().clone())
+    angle = torch.linspace(0, 2 * torch.pi, 61)[:-1]
+    around = torch.stack((angle.cos(), angle.sin()))
+    true_support = (torch.from_numpy(vertices).float() @ around).amax(0)
+    for _ in range(STEPS):
+        placed = _placed(shape, latent, free if scene else 0 * free)
+        support = ((placed @ around).amax(-2) - true_support).abs().mean(-1)
+        loss = _distance(true, placed).mean(-1) + support
+        valid = shape.valid(latent.detach())
+        better = (loss.detach() < best) & valid
+        best = torch.where(better, loss.detach(), best)
+        for store, now in zip(kept, (latent, free), strict=True):
+            store[better] = now.detach()[better]
+        optimizer.zero_grad()
+        loss.sum().backward()
+        optimizer.step()
+        schedule.step()
+    winner = int(best.argmin())
+    z, parameters = kept[0][winner], kept[1][winner]
+    placed = _placed(shape, z[None], parameters[None] if scene else torch.zeros(1, 4))[0]
+    fitted = placed.double().numpy()
+    distance = shapely.distance(
+        shapely.LinearRing(fitted), shapely.points(uniform_points(vertices))
+    )
+    angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    directions = np.stack((np.cos(angle), np.sin(angle)))
+    hull = (fitted @ directions).max(axis=0) - (vertices @ directions).max(axis=0)
+    return Fit(z.double(), MM * distance, MM * hull)
+
+
+def _placed(shape: DeepSDFShape, latent: Tensor, free: Tensor) -> Tensor:
+    """Head outlines scaled and mounted by bounded transforms of `free`."""
+    scale, x, z, angle = (torch.tanh(free) * torch.tensor(REACH)).unbind(-1)
+    points = (1 + scale)[:, None, None] * shape.boundary_points(latent)
+    return transform_points(torch.stack((x, z, angle), dim=-1), points)
+
+
+def _distance(points: Tensor, polygons: Tensor) -> Tensor:
+    """Distance of points (p, 2) to each closed polygon (k, v, 2): (k, p)."""
+    edges = torch.roll(polygons, -1, 1) - polygons
+    offsets = points[None, :, None] - polygons[:, None]
+    squares = edges.square().sum(-1).clamp_min(1e-12)
+    along = ((offsets * edges[:, None]).sum(-1) / squares[:, None]).clamp(0, 1)
+    apart = offsets - along[..., None] * edges[:, None]
+    return (apart.square().sum(-1).amin(-1) + 1e-10).sqrt()

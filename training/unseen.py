@@ -1,0 +1,69 @@
+"""How well a prior fits objects that it has not seen; the source of `misfit_sd_m`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from tpcd.shape.deepsdf import DeepSDFShape
+from tpcd.shape.ycb import load_ycb, ycb_folder
+from training.config import DataConfig
+from training.evaluate import Spread
+from training.fit import best_fit
+from training.outlines import suitable
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenReport:
+    """Best-fit errors on unseen outlines."""
+
+    figures: dict[str, object]
+    """Errors in mm, for the card."""
+    misfit_sd: float
+    """Root mean square difference of the support functions of outline and best fit [m]."""
+
+
+def object_of(name: str) -> str:
+    """The object a view or mirrored copy belongs to; the 065 cups count as one object."""
+    base = name.split("/")[0]
+    return "065_cups" if base.startswith("065-") else base
+
+
+def unseen_outlines(
+    trained: tuple[str, ...], config: DataConfig
+) -> dict[str, Float64[np.ndarray, "_ 2"]]:
+    """Suitable main views of YCB objects of which no view was trained on; {} without YCB."""
+    if ycb_folder() is None:
+        return {}
+    seen = {object_of(name) for name in trained}
+    views = {name: outline.vertices for name, outline in load_ycb("main").items()}
+    return {n: v for n, v in views.items() if object_of(n) not in seen and suitable(v, config)}
+
+
+def measure_unseen(
+    shape: DeepSDFShape, outlines: dict[str, Float64[np.ndarray, "_ 2"]], seed: int = 0
+) -> UnseenReport:
+    """Fit every outline with and without scale and mount."""
+    generator = torch.Generator().manual_seed(seed)
+    with_scene = {n: best_fit(shape, v, generator) for n, v in outlines.items()}
+    alone = {n: best_fit(shape, v, generator, scene=False) for n, v in outlines.items()}
+    hull = np.concatenate([fit.hull_errors_mm for fit in with_scene.values()])
+    misfit = float(np.sqrt(np.square(hull).mean()))
+    figures: dict[str, object] = {
+        "outlines": len(outlines),
+        "best_fit_mm": vars(Spread.of(_pooled(with_scene))),
+        "best_fit_latent_only_mm": vars(Spread.of(_pooled(alone))),
+        "hull_rms_mm": round(misfit, 4),
+        "mean_mm_by_outline": {
+            name: round(float(fit.errors_mm.mean()), 3) for name, fit in with_scene.items()
+        },
+        "fitted": "latent, scale in [0.8, 1.2], mount within 20 mm and 0.2 rad",
+    }
+    return UnseenReport(figures, misfit / 1000.0)
+
+
+def _pooled(fits: dict) -> np.ndarray:
+    return np.concatenate([fit.errors_mm for fit in fits.values()])

@@ -30,6 +30,8 @@ class History:
 
     start: Float[Tensor, "n 3"]
     start_variance: Float[Tensor, "n 3"]
+    previous: Float[Tensor, "n 3"]
+    """Command at which the arm rested in the start pose."""
     command: Float[Tensor, "n 3"]
     settled: Float[Tensor, "n 3"]
     settled_variance: Float[Tensor, "n 3"]
@@ -44,6 +46,7 @@ class History:
         return History(
             self.start[:count],
             self.start_variance[:count],
+            self.previous[:count],
             self.command[:count],
             self.settled[:count],
             self.settled_variance[:count],
@@ -73,6 +76,7 @@ def history_of(episode: Episode, least_std: float = 2e-5) -> History:
     return History(
         start=poses[:-1],
         start_variance=(pose_variance + bad)[:-1],
+        previous=commands[:-1],
         command=commands[1:],
         settled=settled[1:],
         settled_variance=(merged + bad)[1:],

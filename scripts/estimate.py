@@ -1,0 +1,77 @@
+"""Estimate object, mount, friction, floor and wall from one recorded episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tpcd.cli import run
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Settings of the command; lengths in metres."""
+
+    episode: Path
+    """Episode to learn from: NAME.csv, NAME.parquet or a folder with one episode."""
+    prior: str
+    """Shape prior: a checkpoint folder, or the name of a shipped one such as ycb-rich."""
+    out: Path
+    """Folder for the results; must not hold an earlier run."""
+    estimator: Literal["default", "paper"] = "default"
+    """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
+    particles: int = 1000
+    """Particles of the belief (the filter `paper` has its own number)."""
+    misfit: float | None = None
+    """Standard deviation of the outline error [m]; by default the prior's own figure."""
+    seed: int = 0
+    """Seed of all random numbers."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+
+
+def estimate_episode(config: Estimate) -> None:
+    """Estimate the contact model from an episode and write the belief to a run folder."""
+    import torch
+
+    from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.data import check_episode, read_episode
+    from tpcd.results import format_table, open_run, write_results
+    from tpcd.runs.estimation import run_estimation, summarise
+    from tpcd.shape.checkpoint import load_prior
+
+    episode = read_episode(config.episode)
+    shape = load_prior(config.prior)
+    for warning in check_episode(episode):
+        print(f"warning: {warning}")
+    folder = open_run(config.out, "scripts/estimate.py", config, config.overwrite)
+    generator = torch.Generator().manual_seed(config.seed)
+    if config.estimator == "paper":
+        from tpcd.belief.paper import estimate_paper
+
+        steps = estimate_paper(episode, shape, generator)
+    else:
+        settings = EstimatorSettings(
+            sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
+        )
+        steps = estimate(episode, shape, generator, settings)
+    belief = run_estimation(steps, episode, config.prior, folder)
+    table = [
+        {
+            "parameter": name,
+            "mean": entry["mean"],
+            "low 5 %": entry["interval_90"][0],
+            "high 95 %": entry["interval_90"][1],
+            "unit": entry["unit"],
+            "": "still the prior" if entry["still_the_prior"] else "",
+        }
+        for name, entry in summarise(belief)["parameters"].items()
+    ]
+    print(format_table(table))
+    write_results(folder, table, seeds=[config.seed])
+    print(f"\nresults in {folder}; next: python scripts/predict.py {folder} EPISODE --out FILE.csv")
+
+
+if __name__ == "__main__":
+    run(estimate_episode, Estimate, positional=("episode",))

@@ -1,0 +1,86 @@
+"""Predict the rows of episodes from a belief, and score the predictions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tpcd.cli import run
+
+
+@dataclass(frozen=True)
+class Predict:
+    """Settings of the command."""
+
+    run: Path
+    """Run folder that scripts/estimate.py wrote."""
+    episodes: tuple[Path, ...]
+    """Episodes to predict, one or more."""
+    out: Path
+    """CSV file for the predictions."""
+    rollout: bool = False
+    """Start at row 0 and feed on own predictions, instead of on every measured pose."""
+    of: Literal["measured", "true"] = "measured"
+    """Intervals of what the sensors read (episode's noise included) or of what is true."""
+    particles: int = 400
+    """Particles used for prediction."""
+    seed: int = 0
+    """Seed of the rollout's random numbers."""
+    overwrite: bool = False
+    """Replace an existing file."""
+
+
+def predict_episodes(config: Predict) -> None:
+    """Predict every row of the episodes from the row before and print error and coverage."""
+    import torch
+
+    from tpcd.belief.storage import load_belief
+    from tpcd.data import read_episode
+    from tpcd.errors import RunError
+    from tpcd.predict import ContactPredictor
+    from tpcd.results import format_table
+    from tpcd.runs.prediction import (
+        PredictedRows,
+        measured_rows,
+        predict_rows,
+        rollout_rows,
+        score_rows,
+        write_prediction,
+    )
+
+    if config.out.exists() and not config.overwrite:
+        raise RunError(config.out, "exists already", "choose another name or pass --overwrite")
+    episodes = [read_episode(path) for path in config.episodes]
+    belief = load_belief(config.run)
+    for path, episode in zip(config.episodes, episodes, strict=True):
+        if not torch.allclose(episode.stiffness, belief.stiffness):
+            raise RunError(
+                path,
+                f"stiffness {episode.stiffness.tolist()} is not that of the belief "
+                f"{belief.stiffness.tolist()}",
+                "predict episodes recorded with the same controller",
+            )
+    predictor = ContactPredictor(belief, config.particles)
+    generator = torch.Generator().manual_seed(config.seed)
+    predicted: list[PredictedRows] = []
+    for episode in episodes:
+        if config.rollout:
+            predicted.append(rollout_rows(predictor, episode, generator, config.of))
+        else:
+            predicted.append(predict_rows(predictor, episode, config.of))
+    write_prediction(predicted, config.out)
+    everything = PredictedRows(
+        *(torch.cat([getattr(p, name) for p in predicted]) for name in vars(predicted[0]))
+    )
+    rows = torch.cat([measured_rows(episode)[1:] for episode in episodes])
+    kind = "rollout" if config.rollout else "one-step"
+    print(f"{kind} predictions of {len(rows)} rows, against the rows as measured")
+    print(format_table(score_rows(everything, rows)))
+    if config.of == "true":
+        print("intervals leave sensor noise out, so noisy rows fall outside of them more often")
+    print(f"predictions in {config.out}")
+
+
+if __name__ == "__main__":
+    run(predict_episodes, Predict, positional=("run", "episodes"))

@@ -1,0 +1,97 @@
+"""A belief on disk: `belief.safetensors` beside `belief.json`, nothing unpickled.
+
+The JSON names the shape prior by path and by the hash of its weights, since particles mean
+nothing under another prior.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from tpcd.belief.belief import Belief
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import ParameterPrior
+from tpcd.errors import RunError
+from tpcd.results import read_json, write_json
+from tpcd.shape.checkpoint import find_prior, load_prior
+from tpcd.shape.protocol import Shape
+from tpcd.simulator import StepSettings
+
+FORMAT_VERSION = 1
+_TENSORS = ("vectors", "weights", "misfit_mean", "misfit_precision", "stiffness")
+
+
+def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
+    """Write the belief into a folder; `prior` is the checkpoint its latents belong to."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {name: getattr(belief, name).contiguous() for name in _TENSORS}
+    tensors |= {"low": belief.prior.low, "high": belief.prior.high}
+    target = folder / "belief.safetensors"
+    staged = target.with_suffix(".staged")
+    staged.write_bytes(save_tensors(tensors))
+    os.replace(staged, target)
+    return write_json(
+        folder / "belief.json",
+        {
+            "format": "tpcd-belief",
+            "format_version": FORMAT_VERSION,
+            "names": list(belief.prior.names),
+            "units": list(belief.prior.units),
+            "prior": str(prior),
+            "prior_sha256": prior_hash(prior),
+            "misfit": asdict(belief.misfit),
+            "step": asdict(belief.step),
+            "log_evidence": belief.log_evidence,
+            "log_evidence_std": belief.log_evidence_std,
+        },
+    )
+
+
+def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
+    """Read a belief back, with its shape prior unless `shape` is given.
+
+    Raises `RunError` where the folder holds no belief of this version or its prior is
+    another one than it was made with.
+    """
+    path = Path(folder) / "belief.json"
+    if not path.is_file():
+        raise RunError(path, "no such file", "give the folder that estimate wrote")
+    card = read_json(path)
+    if card.get("format") != "tpcd-belief" or card.get("format_version") != FORMAT_VERSION:
+        found = f"{card.get('format')} version {card.get('format_version')}"
+        raise RunError(path, f"holds {found}, expected tpcd-belief version {FORMAT_VERSION}")
+    if shape is None:
+        if prior_hash(card["prior"]) != card["prior_sha256"]:
+            raise RunError(
+                path, f"was made with other weights of the prior {card['prior']}", "estimate again"
+            )
+        shape = load_prior(card["prior"])
+    data = Path(folder) / "belief.safetensors"
+    try:
+        tensors = load_tensors(data.read_bytes())
+        values = {name: tensors[name].to(torch.float64) for name in (*_TENSORS, "low", "high")}
+    except FileNotFoundError as error:
+        raise RunError(data, "no such file", "estimate again") from error
+    except Exception as error:  # safetensors raises its own kinds
+        raise RunError(data, f"cannot be read ({error})", "estimate again") from error
+    return Belief(
+        prior=ParameterPrior(shape, values.pop("low"), values.pop("high")),
+        misfit=MisfitField(**card["misfit"]),
+        step=StepSettings(**card["step"]),
+        log_evidence=card["log_evidence"],
+        log_evidence_std=card["log_evidence_std"],
+        **values,
+    )
+
+
+def prior_hash(prior: str | Path) -> str:
+    """SHA-256 of the weights of a shape prior."""
+    return hashlib.sha256((find_prior(prior) / "weights.safetensors").read_bytes()).hexdigest()

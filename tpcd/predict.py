@@ -1,0 +1,246 @@
+"""The learnt contact dynamics p(x', w' | x, u) as an object to hold, ask and plan with.
+
+Each particle of the belief predicts a normal distribution of the settled pose: the model's
+pose moved by the mean of its misfit field, with the field's remaining uncertainty and the
+propagated noise of the start pose. The prediction is the mixture over particles. The wrench
+follows from the pose, w = K (x' - u), so one mixture serves both.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tpcd.belief.belief import Belief
+from tpcd.belief.likelihood import column_scene
+from tpcd.belief.misfit import misfit_rows
+from tpcd.belief.resampling import systematic_resample
+from tpcd.contact import ContactScene, scene_from_parameters
+from tpcd.parameters import Parameters
+from tpcd.planar import wrap_angle
+from tpcd.simulator import StepStatus, simulate_step
+
+CHANNELS = ("x", "z", "phi", "F_x", "F_z", "tau")
+"""The predicted channels in order; units m, m, rad, N, N, N·m."""
+LEAST_STD = 1e-5
+"""Numerical noise of the model itself [m, m, rad]; keeps every component a proper normal."""
+_BISECTIONS = 40
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A mixture of normals for each of n transitions, over m particles.
+
+    `component_mean` and `component_std` are those of the settled pose given the particle;
+    channel order and units as in `CHANNELS`.
+    """
+
+    command: Float[Tensor, "n 3"]
+    stiffness: Float[Tensor, " 3"]
+    weights: Float[Tensor, "m n"]
+    """Weights of the particles for each transition; 0 for a particle that gave no answer."""
+    component_mean: Float[Tensor, "m n 3"]
+    component_covariance: Float[Tensor, "m n 3 3"]
+    component_mode: Int[Tensor, "m n t"]
+    answered: Bool[Tensor, " n"]
+    """Whether any particle gave an answer; where not, everything else is NaN."""
+    sensor_variance: Float[Tensor, " 6"]
+    """Variance of the sensor noise that is part of the prediction."""
+
+    @property
+    def component_variance(self) -> Float[Tensor, "m n 3"]:
+        """Variances of the settled pose given the particle."""
+        return self.component_covariance.diagonal(dim1=-2, dim2=-1)
+
+    @property
+    def mean(self) -> Float[Tensor, "n 6"]:
+        """Mean of pose and wrench."""
+        pose = (self.weights[..., None] * self.component_mean).sum(0)
+        return self._with_wrench(pose)
+
+    @property
+    def std(self) -> Float[Tensor, "n 6"]:
+        """Standard deviation of pose and wrench."""
+        centre = (self.weights[..., None] * self.component_mean).sum(0)
+        square = self.component_variance + (self.component_mean - centre) ** 2
+        pose = (self.weights[..., None] * square).sum(0)
+        variance = torch.cat((pose, pose * self.stiffness**2), dim=-1) + self.sensor_variance
+        return variance.sqrt()
+
+    @property
+    def mode_probability(self) -> Float[Tensor, "n t 4"]:
+        """Probability of each `ContactMode` against each terrain."""
+        one_hot = torch.nn.functional.one_hot(self.component_mode, 4).to(self.weights.dtype)
+        return (self.weights[..., None, None] * one_hot).sum(0)
+
+    def quantile(self, level: float) -> Float[Tensor, "n 6"]:
+        """The level at which each channel's distribution function is reached.
+
+        Raises ValueError for a level outside of (0, 1).
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level is {level}, expected a number between 0 and 1")
+        mean, std = self._components()
+        weights = self.weights[..., None]
+        low = (mean - 12 * std).amin(0)
+        high = (mean + 12 * std).amax(0)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            below = (weights * torch.special.ndtr((middle - mean) / std)).sum(0) < level
+            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+        middle = 0.5 * (low + high)
+        return torch.where(self.answered[:, None], middle, torch.nan)
+
+    def probability_below(self, value: Float[Tensor, "n 6"]) -> Float[Tensor, "n 6"]:
+        """Each channel's distribution function at a value: the probability integral transform."""
+        mean, std = self._components()
+        offset = value - mean
+        turn = wrap_angle(offset[..., 2:3])
+        offset = torch.cat((offset[..., :2], turn, offset[..., 3:]), dim=-1)
+        return (self.weights[..., None] * torch.special.ndtr(offset / std)).sum(0)
+
+    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count n 6"]:
+        """Joint draws of pose and wrench for each transition."""
+        weights = torch.where(self.answered, self.weights, 1.0 / len(self.weights))
+        chosen = torch.multinomial(weights.T, count, replacement=True, generator=generator).T
+        columns = torch.arange(chosen.shape[1])
+        mean = self.component_mean[chosen, columns]
+        factor = torch.linalg.cholesky(self.component_covariance[chosen, columns])
+        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
+        draws = self._with_wrench(mean + (factor @ noise[..., None])[..., 0])
+        sensor = torch.randn(draws.shape, generator=generator, dtype=mean.dtype)
+        return draws + sensor * self.sensor_variance.sqrt()
+
+    def _components(self) -> tuple[Tensor, Tensor]:
+        mean = self._with_wrench(self.component_mean)
+        variance = self.component_variance
+        variance = torch.cat((variance, variance * self.stiffness**2), dim=-1)
+        return mean, (variance + self.sensor_variance).sqrt()
+
+    def _with_wrench(self, pose: Tensor) -> Tensor:
+        offset = pose - self.command
+        offset = torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)
+        return torch.cat((pose, self.stiffness * offset), dim=-1)
+
+
+class ContactPredictor:
+    """Predicts settled pose and wrench from a belief; its answers are differentiable in u."""
+
+    def __init__(self, belief: Belief, particles: int = 400) -> None:
+        """Keep at most `particles` particles, chosen evenly by weight."""
+        if particles < 1:
+            raise ValueError(f"particles is {particles}, expected at least 1")
+        self.belief = belief
+        if len(belief.weights) > particles:
+            generator = torch.Generator().manual_seed(0)
+            keep = systematic_resample(belief.weights, particles, generator)
+            self._weights = torch.full((particles,), 1.0 / particles, dtype=torch.float64)
+        else:
+            keep = torch.arange(len(belief.weights))
+            self._weights = belief.weights
+        parameters = Parameters.from_vector(belief.vectors[keep])
+        with torch.no_grad():
+            scene = scene_from_parameters(belief.prior.shape, parameters)
+        self._scene: ContactScene = column_scene(scene)
+        self._field_mean = belief.misfit_mean[keep]
+        precision = belief.misfit_precision[keep]
+        self._field_factor = torch.linalg.cholesky(precision) if precision.shape[-1] else precision
+
+    def predict(
+        self,
+        pose: Float[Tensor, "n 3"],
+        command: Float[Tensor, "n 3"],
+        previous: Float[Tensor, "n 3"] | None = None,
+        pose_std: Float[Tensor, " 3"] | None = None,
+        sensor_std: Float[Tensor, " 6"] | None = None,
+    ) -> Prediction:
+        """Predict n transitions from pose and command [m, m, rad].
+
+        `previous` is the command at which the arm rested in `pose` (None: without load).
+        `pose_std` is the noise of `pose` where it was measured (None: exact). With
+        `sensor_std`, noise of the six channels, the prediction is of what sensors will read;
+        without, of what will truly be.
+        """
+        start_variance = pose.new_zeros(3) if pose_std is None else pose_std.double() ** 2
+        transition = simulate_step(
+            self._scene,
+            pose.double(),
+            command.double(),
+            self.belief.stiffness,
+            self.belief.step,
+            previous=None if previous is None else previous.double(),
+        )
+        settled = transition.pose
+        # Angles are averaged near the command, the short way round.
+        turn = command[:, 2:] + wrap_angle(settled[..., 2:] - command[:, 2:])
+        settled = torch.cat((settled[..., :2], turn), dim=-1)
+        spread = transition.pose_from_start * start_variance.sqrt()
+        covariance = spread @ spread.mT + LEAST_STD**2 * torch.eye(3, dtype=torch.float64)
+        rows, uncovered = misfit_rows(self.belief.misfit, settled[..., 2].detach(), transition)
+        covariance = covariance + uncovered
+        if rows.shape[-1]:
+            settled = settled + (rows @ self._field_mean[:, None, :, None])[..., 0]
+            flat = rows.flatten(1, 2).mT
+            scaled = torch.linalg.solve_triangular(self._field_factor, flat, upper=False)
+            scaled = scaled.mT.unflatten(1, rows.shape[1:3])
+            covariance = covariance + scaled @ scaled.mT
+        usable = transition.status <= int(StepStatus.RELAXED)
+        usable = usable & torch.isfinite(settled).all(-1)
+        weights = torch.where(usable, self._weights[:, None], 0.0)
+        total = weights.sum(0)
+        answered = total > 0
+        share = weights / torch.where(answered, total, math.nan)
+        keep = usable[..., None]
+        identity = torch.eye(3, dtype=torch.float64)
+        sensor = pose.new_zeros(6) if sensor_std is None else sensor_std.double() ** 2
+        return Prediction(
+            command=command.double(),
+            stiffness=self.belief.stiffness,
+            weights=share,
+            component_mean=torch.where(keep, settled, 0.0),
+            component_covariance=torch.where(keep[..., None], covariance, identity),
+            component_mode=transition.mode,
+            answered=answered,
+            sensor_variance=sensor.double(),
+        )
+
+    def rollout(
+        self,
+        pose: Float[Tensor, " 3"],
+        commands: Float[Tensor, "n 3"],
+        generator: torch.Generator,
+        samples: int = 200,
+        previous: Float[Tensor, " 3"] | None = None,
+    ) -> Float[Tensor, "samples n 6"]:
+        """Draw whole trajectories: every particle follows its own poses, n steps long.
+
+        Each trajectory keeps one theta and one draw of its misfit field throughout.
+        """
+        chosen = torch.multinomial(self._weights, samples, replacement=True, generator=generator)
+        scene = self._scene.gather(chosen)
+        field = self._field_mean[chosen]
+        if field.shape[-1]:
+            noise = torch.randn(field.shape, generator=generator, dtype=torch.float64)
+            factor = self._field_factor[chosen].mT
+            field = field + torch.linalg.solve_triangular(factor, noise[..., None], upper=True)[..., 0]
+        here = pose.double().expand(samples, 3)
+        before = None if previous is None else previous.double()
+        steps = []
+        stiffness = self.belief.stiffness
+        for command in commands.double():
+            transition = simulate_step(
+                scene, here, command, stiffness, self.belief.step, previous=before
+            )
+            here = transition.pose
+            rows, uncovered = misfit_rows(self.belief.misfit, here[..., 2], transition)
+            if rows.shape[-1]:
+                here = here + (rows @ field[..., None])[..., 0]
+            offset = here - command
+            offset = torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)
+            steps.append(torch.cat((here, stiffness * offset), dim=-1))
+            before = command
+        return torch.stack(steps, dim=1)

@@ -1,0 +1,193 @@
+"""An estimation into a run folder: belief, summary, progress, figures, TensorBoard.
+
+The folder holds `belief.*` (saved after every step), `steps.jsonl` (one line for each step),
+`summary.json`, `figures/*.png` and a TensorBoard run in `tensorboard`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tpcd.belief.belief import Belief, EstimationStep
+from tpcd.belief.storage import save_belief
+from tpcd.contact import place_points
+from tpcd.data.episode import Episode
+from tpcd.figures.outline import outline_belief
+from tpcd.figures.progress import estimation_progress
+from tpcd.figures.scene import scene as scene_figure
+from tpcd.figures.sinks import save_figure
+from tpcd.results import write_json
+
+STILL_PRIOR = 0.85
+"""A 90 % interval wider than this share of the prior's counts as nothing learnt."""
+OUTLINES_DRAWN = 200
+
+
+@dataclass(frozen=True)
+class KnownTruth:
+    """What a simulation knows and an estimator does not; drawn beside the belief."""
+
+    vertices_ee: Tensor
+    scene: dict[str, float]
+
+
+def run_estimation(
+    steps: Iterator[EstimationStep],
+    episode: Episode,
+    prior_name: str,
+    folder: Path,
+    truth: KnownTruth | None = None,
+    show_progress: bool = True,
+) -> Belief:
+    """Draw the steps of an estimator to their end, saving as it goes; returns the belief."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    figures = folder / "figures"
+    history: list[dict[str, Any]] = []
+    belief: Belief | None = None
+    with (
+        SummaryWriter(folder / "tensorboard") as writer,
+        (folder / "steps.jsonl").open("w", encoding="utf-8") as lines,
+        tqdm(total=len(episode) - 1, unit="step", disable=not show_progress) as bar,
+    ):
+        for step in steps:
+            learnt = _learnt_most(belief, step.belief)
+            belief = step.belief
+            row = _step_row(step, learnt)
+            history.append(row)
+            lines.write(json.dumps(row) + "\n")
+            lines.flush()
+            save_belief(belief, folder, prior_name)
+            _log_scalars(writer, row, step)
+            bar.set_postfix_str(
+                f"n_eff {row['effective_sample_size']:.0f}, learnt {learnt}, "
+                f"{row['seconds']:.2f} s/step"
+            )
+            bar.update()
+        if belief is None:
+            raise ValueError("the episode has no transitions, expected at least two rows")
+        write_json(folder / "summary.json", summarise(belief))
+        _draw(belief, history, episode, figures, writer, truth)
+    return belief
+
+
+def summarise(belief: Belief) -> dict[str, Any]:
+    """Mean, 90 % interval, unit and whether it is still the prior, for each parameter."""
+    prior = prior_interval(belief)
+    low, high = belief.quantile(0.05), belief.quantile(0.95)
+    mean, std = belief.mean(), belief.std()
+    entries = {}
+    for i, (name, unit) in enumerate(zip(belief.prior.names, belief.prior.units, strict=True)):
+        width = float(high[i] - low[i]) / float(prior[1][i] - prior[0][i])
+        entries[name] = {
+            "mean": float(mean[i]),
+            "std": float(std[i]),
+            "interval_90": [float(low[i]), float(high[i])],
+            "unit": unit,
+            "still_the_prior": width > STILL_PRIOR,
+        }
+    return {
+        "parameters": entries,
+        "log_evidence": belief.log_evidence,
+        "log_evidence_std": belief.log_evidence_std,
+        "outline_misfit_sd": belief.misfit.sd,
+        "particles": len(belief.weights),
+    }
+
+
+def prior_interval(belief: Belief) -> tuple[Tensor, Tensor]:
+    """The 90 % interval of every entry of theta before any datum."""
+    prior = belief.prior
+    draws = prior.to_vector(prior.sample(4000, torch.Generator().manual_seed(0)))
+    levels = torch.tensor([0.05, 0.95], dtype=torch.float64)
+    low, high = torch.quantile(draws, levels, dim=0)
+    return low, high
+
+
+def _learnt_most(before: Belief | None, now: Belief) -> str:
+    """The parameter whose spread shrank most in this step."""
+    names, std = now.prior.names, now.std()
+    if before is None:
+        low, high = prior_interval(now)
+        reference = (high - low) / 3.29
+    else:
+        reference = before.std()
+    return names[int((std / reference.clamp_min(1e-12)).argmin())]
+
+
+def _step_row(step: EstimationStep, learnt: str) -> dict[str, Any]:
+    belief = step.belief
+    return {
+        "step": step.index,
+        "seconds": step.seconds,
+        "learnt_most": learnt,
+        "effective_sample_size": float(step.info.effective_sample_size),
+        "log_evidence": belief.log_evidence,
+        "mean": belief.mean().tolist(),
+        "low": belief.quantile(0.05).tolist(),
+        "high": belief.quantile(0.95).tolist(),
+    }
+
+
+def _log_scalars(writer: Any, row: dict[str, Any], step: EstimationStep) -> None:
+    writer.add_scalar("sampler/effective_sample_size", row["effective_sample_size"], step.index)
+    writer.add_scalar("sampler/seconds", step.seconds, step.index)
+    writer.add_scalar("sampler/log_evidence", row["log_evidence"], step.index)
+    for name, mean, std in zip(
+        step.belief.prior.names, step.belief.mean(), step.belief.std(), strict=True
+    ):
+        writer.add_scalar(f"mean/{name}", float(mean), step.index)
+        writer.add_scalar(f"std/{name}", float(std), step.index)
+
+
+def _draw(
+    belief: Belief,
+    history: list[dict[str, Any]],
+    episode: Episode,
+    folder: Path,
+    writer: Any,
+    truth: KnownTruth | None,
+) -> None:
+    z = belief.prior.shape.latent_dim
+    names, units = belief.prior.names[z:], belief.prior.units[z:]
+    columns = {
+        key: torch.tensor([row[key] for row in history])[:, z:].numpy()
+        for key in ("mean", "low", "high")
+    }
+    known = None if truth is None else torch.tensor([truth.scene[name] for name in names]).numpy()
+    last = len(history)
+    figure = estimation_progress(
+        torch.arange(1, last + 1).numpy(), **columns, names=names, units=units, truth=known
+    )
+    save_figure(figure, folder, "estimation", writer, last)
+    chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()
+    parameters = belief.parameters
+    with torch.no_grad():
+        outline = belief.prior.shape.boundary_points(parameters.latent[chosen])
+    points = place_points(outline, parameters.scale[chosen], parameters.mount[chosen])
+    vertices = None if truth is None else truth.vertices_ee.numpy()
+    figure = outline_belief(points.double().numpy(), belief.weights[chosen].numpy(), vertices)
+    save_figure(figure, folder, "outline", writer, last)
+    surfaces = {}
+    for name in ("floor_height", "wall_position"):
+        i = names.index(name)
+        surfaces[name] = tuple(float(columns[key][-1, i]) for key in ("mean", "low", "high"))
+    central = points[int(belief.weights[chosen].argmax())].double().numpy()
+    figure = scene_figure(
+        episode.poses.numpy(),
+        central if vertices is None else vertices,
+        surfaces["floor_height"],
+        surfaces["wall_position"],
+        true_floor=None if truth is None else truth.scene["floor_height"],
+        true_wall=None if truth is None else truth.scene["wall_position"],
+        commands=episode.commands.numpy(),
+    )
+    save_figure(figure, folder, "scene", writer, last)

@@ -1,0 +1,145 @@
+"""One-step and rollout predictions of an episode, as rows and as scores.
+
+Row k predicts row k of the episode from the measured pose of row k - 1 and command k. The
+command of row k - 1 tells what the arm was pressed against. Intervals are of what sensors
+read (the episode's noise included) or of what is true, as asked.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.data.episode import Episode
+from tpcd.planar import wrap_angle
+from tpcd.predict import CHANNELS, ContactPredictor
+
+CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
+ROLLOUT_SAMPLES = 400
+
+
+@dataclass(frozen=True)
+class PredictedRows:
+    """Predictions of rows 1..n of an episode; channels as in `CHANNELS`, SI units."""
+
+    mean: Float[Tensor, "n 6"]
+    std: Float[Tensor, "n 6"]
+    low: Float[Tensor, "n 6"]
+    high: Float[Tensor, "n 6"]
+    transform: Float[Tensor, "n 6"]
+    """The predicted distribution function at the episode's own rows."""
+
+
+def predict_rows(
+    predictor: ContactPredictor,
+    episode: Episode,
+    of: Literal["measured", "true"] = "measured",
+    reference: Episode | None = None,
+) -> PredictedRows:
+    """One-step predictions of every row but the first.
+
+    `reference` holds the rows to evaluate the distribution function at (default: the
+    episode's own); with `of='true'` it should be noise-free.
+    """
+    sensor = episode.sensor_std if of == "measured" else None
+    prediction = predictor.predict(
+        episode.poses[:-1],
+        episode.commands[1:],
+        previous=episode.commands[:-1],
+        pose_std=episode.sensor_std[:3],
+        sensor_std=sensor,
+    )
+    rows = measured_rows(reference or episode)[1:]
+    return PredictedRows(
+        mean=prediction.mean,
+        std=prediction.std,
+        low=prediction.quantile(0.05),
+        high=prediction.quantile(0.95),
+        transform=prediction.probability_below(rows),
+    )
+
+
+def rollout_rows(
+    predictor: ContactPredictor,
+    episode: Episode,
+    generator: torch.Generator,
+    of: Literal["measured", "true"] = "measured",
+    reference: Episode | None = None,
+) -> PredictedRows:
+    """Predictions that start at row 0 and feed on themselves, by sampling trajectories."""
+    draws = predictor.rollout(
+        episode.poses[0], episode.commands[1:], generator, samples=ROLLOUT_SAMPLES
+    )
+    if of == "measured":
+        noise = torch.randn(draws.shape, generator=generator, dtype=draws.dtype)
+        draws = draws + noise * episode.sensor_std
+    rows = measured_rows(reference or episode)[1:]
+    levels = torch.tensor([0.05, 0.95], dtype=draws.dtype)
+    low, high = torch.quantile(draws, levels, dim=0)
+    return PredictedRows(
+        mean=draws.mean(0),
+        std=draws.std(0),
+        low=low,
+        high=high,
+        transform=(draws < rows).double().mean(0),
+    )
+
+
+def measured_rows(episode: Episode) -> Float[Tensor, "n 6"]:
+    """Pose and wrench of every row side by side."""
+    return torch.cat((episode.poses, episode.wrenches), dim=-1)
+
+
+def prediction_error(rows: Float[Tensor, "n 6"], mean: Float[Tensor, "n 6"]) -> Tensor:
+    """Predicted minus actual for each row and channel, angles wrapped."""
+    error = mean - rows
+    return torch.cat((error[:, :2], wrap_angle(error[:, 2:3]), error[:, 3:]), dim=-1)
+
+
+def score_rows(predicted: PredictedRows, rows: Float[Tensor, "n 6"]) -> list[dict[str, Any]]:
+    """For each channel: mean absolute error, its standard deviation, 90 % coverage."""
+    error = prediction_error(rows, predicted.mean).abs()
+    inside = (predicted.transform > 0.05) & (predicted.transform < 0.95)
+    return [
+        {
+            "channel": name,
+            "unit": unit,
+            "mae": float(error[:, i].mean()),
+            "sd": float(error[:, i].std(correction=0)),
+            "coverage_90": float(inside[:, i].double().mean()),
+            "rows": len(error),
+        }
+        for i, (name, unit) in enumerate(zip(CHANNELS, CHANNEL_UNITS, strict=True))
+    ]
+
+
+def write_prediction(predicted: list[PredictedRows], path: Path) -> None:
+    """Write predictions of one or several episodes as CSV in one move.
+
+    Columns `step`, then mean, sd, q05 and q95 of each channel; with several episodes a first
+    column `episode` counts them from 0.
+    """
+    header = ["episode"] if len(predicted) > 1 else []
+    header += ["step"]
+    for name in CHANNELS:
+        header += [f"{name}_{what}" for what in ("mean", "sd", "q05", "q95")]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for number, rows in enumerate(predicted):
+        table = torch.stack((rows.mean, rows.std, rows.low, rows.high), dim=-1).flatten(1)
+        for step, values in enumerate(table.tolist(), start=1):
+            lead = [number, step] if len(predicted) > 1 else [step]
+            writer.writerow([*lead, *(repr(value) for value in values)])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    staged = path.with_name(f".{path.name}.staged")
+    staged.write_text(text.getvalue(), encoding="utf-8")
+    os.replace(staged, path)

@@ -8,10 +8,10 @@ A = I / sd^2 + sum_k H_k^T S_k^-1 H_k and v = sum_k H_k^T S_k^-1 r_k
     log p(data | theta) = sum_k log N(r_k; 0, S_k) + 1/2 v^T A^-1 v - 1/2 log |sd^2 A|,
 
 while c given the data is N(A^-1 v, A^-1). A transition far outside of what theta and the
-field allow (an object wedged between floor and wall, a bad reading) has its S_k inflated
-until it is just at the border: its log likelihood then falls with the logarithm of the
-distance, as for a Student distribution, and it no longer bends the belief. A particle whose step does not converge or is not
-finite gets log likelihood -inf.
+field allow (an object wedged between floor and wall, a bad reading) has its S_k grown until
+S_k + sd^2 H_k H_k^T puts it just at the border: its log likelihood then falls with the
+logarithm of the distance, as for a Student distribution, and it no longer bends the belief.
+A particle whose step does not converge or is not finite gets log likelihood -inf.
 """
 
 from __future__ import annotations
@@ -60,14 +60,21 @@ def history_likelihood(
 ) -> HistoryLikelihood:
     """Evaluate m particles on the n transitions of a history."""
     scene = column_scene(scene_from_parameters(shape, parameters))
-    transition = simulate_step(scene, history.start, history.command, history.stiffness, settings)
+    transition = simulate_step(
+        scene,
+        history.start,
+        history.command,
+        history.stiffness,
+        settings,
+        previous=history.previous,
+    )
     residual = history.settled - transition.pose
     residual = torch.cat((residual[..., :2], wrap_angle(residual[..., 2:])), dim=-1)
     spread = transition.pose_from_start * history.start_variance[:, None, :].sqrt()
     covariance = spread @ spread.mT + torch.diag_embed(history.settled_variance)
     rows, uncovered = misfit_rows(field, history.settled[:, 2], transition)
     covariance = covariance + uncovered
-    covariance = covariance * _inflation(field, covariance, residual, rows)
+    covariance = covariance + _outlier_covariance(field, covariance, residual, rows)
     columns = torch.cat((residual[..., None], rows), dim=-1)
     whitened, log_determinant = _whiten(covariance, columns)
     error, rows = whitened[..., 0], whitened[..., 1:]
@@ -82,12 +89,18 @@ def history_likelihood(
     return HistoryLikelihood(total, before, mean, precision)
 
 
-def _inflation(field: MisfitField, covariance: Tensor, residual: Tensor, rows: Tensor) -> Tensor:
-    """Factor on the covariance of transitions that theta does not explain, 1 elsewhere."""
+def _outlier_covariance(
+    field: MisfitField, covariance: Tensor, residual: Tensor, rows: Tensor
+) -> Tensor:
+    """What is added to the covariance of transitions that theta does not explain, else 0.
+
+    With M = covariance + sd^2 H H^T and q = r^T M^-1 r it is (q / limit - 1) M, so that M grows
+    to M q / limit and the distance to the limit itself, whatever share of M is the field's.
+    """
     marginal = covariance + field.sd**2 * (rows @ rows.mT)
     whitened, _ = _whiten(marginal, residual[..., None])
     square = whitened.square().sum((-2, -1))
-    return (square / OUTLIER_SQUARE).clamp_min(1.0)[..., None, None]
+    return ((square / OUTLIER_SQUARE).clamp_min(1.0) - 1.0)[..., None, None] * marginal
 
 
 def column_scene(scene: ContactScene) -> ContactScene:
@@ -107,9 +120,8 @@ def _marginalise(
     """Integrate the field out of whitened residuals (m, n, 3) and rows (m, n, 3, c)."""
     total = each.sum(-1)
     count = rows.shape[-1]
-    if field.sd == 0 or count == 0:
-        empty = error.new_zeros(len(error), count)
-        return total, empty, torch.eye(count).to(error).expand(len(error), -1, -1) * torch.inf
+    if count == 0:
+        return total, error.new_zeros(len(error), 0), error.new_zeros(len(error), 0, 0)
     # Invalid particles carry NaN rows; they must not reach the factorisation.
     valid = torch.isfinite(total)
     flat = torch.where(valid[:, None, None], rows.flatten(1, 2), 0.0)

@@ -43,15 +43,17 @@ class MisfitField:
 
     @property
     def bumps(self) -> int:
-        """Number of bumps for each terrain."""
+        """Number of bumps for each terrain; none where the field is switched off."""
+        if self.sd == 0:
+            return 0
         return 2 * math.ceil(self.reach / self.width) + 1
 
     def basis(
         self, angle: Float[Tensor, "*batch"]
     ) -> tuple[Float[Tensor, "*batch j"], Float[Tensor, "*batch j"]]:
         """Values and derivatives [1/rad] of the bumps at the angles of the object [rad]."""
-        half = self.bumps // 2
-        nodes = self.width * torch.arange(-half, half + 1, dtype=angle.dtype, device=angle.device)
+        place = torch.arange(self.bumps, dtype=angle.dtype, device=angle.device)
+        nodes = self.width * (place - (self.bumps - 1) / 2)
         distance = (angle[..., None] - nodes) / self.width
         # On a lattice spaced by the width, the squared bumps sum to sqrt(pi).
         value = torch.exp(-0.5 * distance**2) * math.pi**-0.25

@@ -29,7 +29,7 @@ from tpcd.contact import ContactScene, scene_from_parameters
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.shape.protocol import Shape
-from tpcd.simulator import StepSettings, StepStatus, simulate_step
+from tpcd.simulator import StepSettings, StepStatus, Transition, native, simulate_step
 from tpcd.terrain import HalfPlane
 
 OUTLIER_SQUARE = 16.3
@@ -68,6 +68,8 @@ def history_likelihood(
         settings,
         previous=history.previous,
     )
+    if native.available() and _detached(transition):
+        return _compiled(history, field, transition)
     residual = history.settled - transition.pose
     residual = torch.cat((residual[..., :2], wrap_angle(residual[..., 2:])), dim=-1)
     spread = transition.pose_from_start * history.start_variance[:, None, :].sqrt()
@@ -86,6 +88,43 @@ def history_likelihood(
         before, _, _ = _marginalise(field, each[:, :-1], error[:, :-1], rows[:, :-1])
     else:
         before = torch.zeros_like(total)
+    return HistoryLikelihood(total, before, mean, precision)
+
+
+def _detached(transition: Transition) -> bool:
+    """Whether the compiled loops may be used: on the CPU, and nobody asks for a gradient."""
+    return transition.pose.device.type == "cpu" and not transition.pose.requires_grad
+
+
+def _compiled(history: History, field: MisfitField, transition: Transition) -> HistoryLikelihood:
+    from tpcd.belief.kernel import evaluate_all
+
+    count = len(transition.pose)
+    size = field.bumps * transition.pose_from_gap.shape[-2]
+    values, slopes = field.basis(history.settled[:, 2])
+    total, before = (torch.empty(count, dtype=torch.float64) for _ in range(2))
+    mean = torch.empty(count, size, dtype=torch.float64)
+    precision = torch.empty(count, size, size, dtype=torch.float64)
+    evaluate_all(
+        transition.pose.numpy(),
+        transition.status.numpy(),
+        transition.pose_from_start.numpy(),
+        transition.pose_from_gap.numpy(),
+        transition.pose_from_lever.numpy(),
+        history.settled.contiguous().numpy(),
+        history.settled_variance.contiguous().numpy(),
+        history.start_variance.contiguous().numpy(),
+        values.numpy(),
+        slopes.numpy(),
+        field.sd,
+        OUTLIER_SQUARE,
+        int(StepStatus.RELAXED),
+        native.chunk_count(count),
+        total.numpy(),
+        before.numpy(),
+        mean.numpy(),
+        precision.numpy(),
+    )
     return HistoryLikelihood(total, before, mean, precision)
 
 

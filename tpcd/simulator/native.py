@@ -28,6 +28,15 @@ def available() -> bool:
     return find_spec("numba") is not None
 
 
+def chunk_count(count: int) -> int:
+    """Parts into which `count` elements are cut; compiled loops get torch's thread number."""
+    import numba
+
+    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    numba.set_num_threads(threads)
+    return max(1, min(8 * threads, math.ceil(count / CHUNK)))
+
+
 def step(
     scene: ContactScene,
     owner: Int[Tensor, " b"],
@@ -38,8 +47,6 @@ def step(
     settings: StepSettings,
 ) -> Transition:
     """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
-    import numba
-
     from tpcd.simulator.kernel import step_all
 
     count, terrains = len(owner), len(scene.terrains)
@@ -56,8 +63,7 @@ def step(
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(threads)
+    chunks = chunk_count(count)
     step_all(
         points.numpy(),
         _flat(normals, terrains, 2),
@@ -75,7 +81,7 @@ def step(
         settings.rounds,
         settings.tolerance,
         settings.compliance,
-        max(1, min(8 * threads, math.ceil(count / CHUNK))),
+        chunks,
         pose.numpy(),
         mode.numpy(),
         status.numpy(),

@@ -38,7 +38,7 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
     from tpcd.data import check_episode, read_episode
     from tpcd.results import format_table, open_run, write_results
-    from tpcd.runs.estimation import run_estimation, summarise
+    from tpcd.commands.estimation import run_estimation, summarise
     from tpcd.shape.checkpoint import load_prior
 
     episode = read_episode(config.episode)

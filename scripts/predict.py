@@ -40,7 +40,7 @@ def predict_episodes(config: Predict) -> None:
     from tpcd.errors import RunError
     from tpcd.predict import ContactPredictor
     from tpcd.results import format_table
-    from tpcd.runs.prediction import (
+    from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
         predict_rows,

@@ -28,7 +28,7 @@ CHANNELS = ("x", "z", "phi", "F_x", "F_z", "tau")
 """The predicted channels in order; units m, m, rad, N, N, N·m."""
 LEAST_STD = 1e-5
 """Numerical noise of the model itself [m, m, rad]; keeps every component a proper normal."""
-_BISECTIONS = 40
+_BISECTIONS = 26
 
 
 @dataclass(frozen=True)

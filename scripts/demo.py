@@ -1,0 +1,122 @@
+"""The main job from end to end: an unknown object, 15 touches, and predictions that hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tpcd.cli import run
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Settings of the demonstration."""
+
+    out: Path = Path("runs/demo")
+    """Folder for the results; an earlier demo there is replaced."""
+    outline: str = "mug"
+    """Built-in outline that plays the unknown object."""
+    prior: str = "ycb-rich"
+    """Shape prior of the estimator; it was trained on other objects."""
+    steps: int = 15
+    """Exploration steps."""
+    tests: int = 3
+    """Held-out trajectories."""
+    test_steps: int = 30
+    """Steps of a held-out trajectory."""
+    seed: int = 0
+    """Seed of scene, motion, noise and sampler."""
+
+
+def demonstrate(config: Demo) -> None:
+    """Explore an unknown object in simulation, learn its contacts, and test the predictions."""
+    import importlib.util
+    import time
+
+    print("loading ...", flush=True)
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+
+    from tpcd.belief import estimate
+    from tpcd.figures.predictions import prediction as prediction_figure
+    from tpcd.figures.quality import calibration
+    from tpcd.figures.sinks import save_figure
+    from tpcd.predict import CHANNELS, ContactPredictor
+    from tpcd.results import format_table, open_run, write_results
+    from tpcd.commands.estimation import KnownTruth, run_estimation
+    from tpcd.commands.prediction import (
+        PredictedRows,
+        measured_rows,
+        predict_rows,
+        score_rows,
+        write_prediction,
+    )
+    from tpcd.shape.builtin import builtin_outlines
+    from tpcd.shape.checkpoint import load_prior
+    from tpcd.truth.recording import make_motion, record, write_recording
+    from tpcd.truth.scene import draw_scene, make_truth
+
+    outlines = builtin_outlines()
+    if config.outline not in outlines:
+        raise ValueError(
+            f"outline is {config.outline!r}, expected one of {', '.join(sorted(outlines))}"
+        )
+    folder = open_run(config.out, "scripts/demo.py", config, overwrite=True)
+    kind = "mujoco" if importlib.util.find_spec("mujoco") else "quasistatic"
+    generator = torch.Generator().manual_seed(config.seed)
+    scene = draw_scene(config.outline, outlines[config.outline].vertices, generator)
+    truth = make_truth(scene, kind)
+    shape = load_prior(config.prior)
+    print(f"unknown object: {config.outline}; simulator of the truth: {kind}; prior: {config.prior}")
+
+    motion = make_motion("rich", scene, config.steps, generator)
+    exploration = record(truth, scene, motion, config.steps, generator)
+    write_recording(exploration, scene, folder / "explore")
+    started = time.perf_counter()
+    steps = estimate(exploration.measured, shape, torch.Generator().manual_seed(config.seed))
+    known = KnownTruth(scene.vertices_ee, scene.theta)
+    belief = run_estimation(steps, exploration.measured, config.prior, folder, known)
+    seconds = (time.perf_counter() - started) / config.steps
+
+    predictor = ContactPredictor(belief)
+    predicted, true_rows = [], []
+    with SummaryWriter(folder / "tensorboard") as writer:
+        for number in range(config.tests):
+            motion = make_motion("test", scene, config.test_steps, generator)
+            test = record(truth, scene, motion, config.test_steps, generator)
+            write_recording(test, scene, folder / f"test_{number}")
+            rows = predict_rows(predictor, test.measured, of="true", reference=test.true)
+            predicted.append(rows)
+            true_rows.append(measured_rows(test.true)[1:])
+            figure = prediction_figure(
+                true_rows[-1].numpy(),
+                rows.mean.numpy(),
+                rows.low.numpy(),
+                rows.high.numpy(),
+                f"held-out trajectory {number}, predicted one step ahead",
+                rows_are="true",
+            )
+            save_figure(figure, folder / "figures", f"test_{number}", writer)
+        everything = PredictedRows(
+            *(torch.cat([getattr(p, name) for p in predicted]) for name in vars(predicted[0]))
+        )
+        figure = calibration(everything.transform.numpy(), CHANNELS)
+        save_figure(figure, folder / "figures", "calibration", writer)
+        table = score_rows(everything, torch.cat(true_rows))
+        text = format_table(table)
+        writer.add_text("table", f"```\n{text}\n```")
+    write_prediction(predicted, folder / "predictions.csv")
+    write_results(folder, table, seeds=[config.seed], seconds_per_step=seconds)
+    print(f"\nerror against the truth on {config.tests} x {config.test_steps} held-out steps:")
+    print(text)
+    print(f"estimation took {seconds:.2f} s per step")
+    print(
+        f"\nresults in {folder}; figures in {folder / 'figures'}\n"
+        f"next:  tensorboard --logdir {folder}\n"
+        f"       python scripts/simulate.py --help     make episodes of other objects\n"
+        f"       python scripts/estimate.py --help     estimate from your own episode"
+    )
+
+
+if __name__ == "__main__":
+    run(demonstrate, Demo)

@@ -50,7 +50,7 @@ class ContactScene:
         """The scenes at positions `index` of the flattened batch."""
         points = self.points_ee
         return ContactScene(
-            points_ee=points.reshape(-1, *points.shape[-2:])[index],
+            points_ee=points.reshape(-1, *points.shape[-2:]).index_select(0, index),
             terrains=tuple(body.gather(index) for body in self.terrains),
             friction=self.friction.reshape(-1, self.friction.shape[-1])[index],
         )

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tpcd.contact import ContactScene, contact_frame, terrain_gaps
+from tpcd.contact import ContactScene, contact_frame
+from tpcd.simulator.lowest import lowest_points
 
 FREE_GAP = 1e-5
 """A start pose flies when every gap exceeds this [m]."""
@@ -41,26 +42,31 @@ def first_touch(
     with torch.no_grad():
         gap_start, _, _ = _lowest(scene, start)
         gap_end, point, terrain = _lowest(scene, command)
-        low, high = torch.zeros_like(gap_start), torch.ones_like(gap_start)
-        value_low, value_high = gap_start.clone(), gap_end.clone()
-        searching = (gap_start > FREE_GAP) & (gap_end < 0)
-        fraction = torch.where((gap_start > FREE_GAP) & (gap_end >= 0), 1.0, 0.0).to(start)
-        last_side = torch.zeros_like(gap_start)
+        flies = gap_start > FREE_GAP
+        fraction = (flies & (gap_end >= 0)).to(start.dtype)
+        index = torch.nonzero(flies & (gap_end < 0)).flatten()
+        part, start, way = scene.gather(index), start[index], (command - start)[index]
+        low, high = torch.zeros_like(gap_start[index]), torch.ones_like(gap_start[index])
+        value_low, value_high = gap_start[index], gap_end[index]
+        last_side = torch.zeros_like(low)
         for _ in range(BISECTIONS):
-            if not bool(searching.any()):
+            if len(index) == 0:
                 break
             trial = (low * value_high - high * value_low) / (value_high - value_low)
             trial = torch.where(torch.isfinite(trial), trial, 0.5 * (low + high))
-            gap, p, t = _lowest(scene, start + trial[:, None] * (command - start))
-            point, terrain = torch.where(searching, p, point), torch.where(searching, t, terrain)
+            gap, point[index], terrain[index] = _lowest(part, start + trial[:, None] * way)
             free = gap >= 0
             value_high = torch.where(free & (last_side > 0), 0.5 * value_high, value_high)
             value_low = torch.where(~free & (last_side < 0), 0.5 * value_low, value_low)
             low, value_low = torch.where(free, trial, low), torch.where(free, gap, value_low)
             high, value_high = torch.where(free, high, trial), torch.where(free, value_high, gap)
             last_side = torch.where(free, 1.0, -1.0).to(gap)
-            fraction = torch.where(searching, low, fraction)
-            searching = searching & (value_low > 1e-9) & (high - low > 1e-9)
+            fraction[index] = low
+            kept = torch.nonzero((value_low > 1e-9) & (high - low > 1e-9)).flatten()
+            if len(kept) < len(index):
+                index, part, start, way = index[kept], part.gather(kept), start[kept], way[kept]
+                low, high, last_side = low[kept], high[kept], last_side[kept]
+                value_low, value_high = value_low[kept], value_high[kept]
         return Flight(fraction, point, terrain)
 
 
@@ -79,7 +85,6 @@ def touch_row(
 
 
 def _lowest(scene: ContactScene, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, pose)
-    lowest, index = gaps.flatten(1).min(-1)
-    points = gaps.shape[-1]
-    return lowest, index % points, torch.div(index, points, rounding_mode="floor")
+    gaps, points = lowest_points(scene, pose, pose.new_zeros(*scene.friction.shape, 1))
+    lowest, terrain = gaps[..., 0].min(-1)
+    return lowest, points[..., 0].gather(1, terrain[:, None])[:, 0], terrain

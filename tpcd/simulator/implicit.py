@@ -23,6 +23,9 @@ from tpcd.contact import ContactFrame, ContactScene, contact_frame
 from tpcd.planar import rotate
 from tpcd.simulator.record import ContactSet, StepSettings
 
+SINGULAR = 1e-12
+"""Determinant over the product of the row sums below which loaded rows count as dependent."""
+
 
 @dataclass(frozen=True)
 class LinearResponse:
@@ -43,7 +46,7 @@ class _System:
     constraint: Tensor
     force: Tensor
     inverse_stiffness: Tensor
-    schur: Tensor
+    inverse_schur: Tensor
     loaded: Tensor
     start_row: Tensor
 
@@ -58,9 +61,22 @@ def newton_pose(
     settings: StepSettings,
 ) -> Float[Tensor, "b 3"]:
     """The settled pose again, now carrying derivatives."""
+    return newton_step(scene, start, command, stiffness, pose, contacts, settings)[0]
+
+
+def newton_step(
+    scene: ContactScene,
+    start: Float[Tensor, "b 3"],
+    command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, " 3"],
+    pose: Float[Tensor, "b 3"],
+    contacts: ContactSet,
+    settings: StepSettings,
+) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
+    """Pose and multipliers after one Newton step on the equations at rest."""
     system = _system(scene, start, command, stiffness, pose, contacts, settings)
-    step = _solve(system, -system.force_residual, -system.row_residual)
-    return pose.detach() + step
+    step, gain = _solve(system, -system.force_residual, -system.row_residual)
+    return pose.detach() + step, contacts.multiplier + gain
 
 
 def linear_response(
@@ -78,18 +94,18 @@ def linear_response(
         zero_force = torch.zeros_like(system.force_residual)
         columns = []
         for axis in range(3):
-            columns.append(_solve(system, zero_force, -system.start_row[..., axis]))
+            columns.append(_solve(system, zero_force, -system.start_row[..., axis])[0])
         for axis in range(3):
             push = torch.zeros_like(zero_force)
             push[:, axis] = stiffness[axis]
-            columns.append(_solve(system, push, torch.zeros_like(system.row_residual)))
+            columns.append(_solve(system, push, torch.zeros_like(system.row_residual))[0])
         gap, lever = [], []
         for t in range(len(scene.terrains)):
             here = ((contacts.terrain == t) & system.loaded).to(pose.dtype)
-            gap.append(_solve(system, zero_force, -here))
+            gap.append(_solve(system, zero_force, -here)[0])
             moment = torch.zeros_like(zero_force)
             moment[:, 2] = (here * contacts.multiplier).sum(-1)
-            lever.append(_solve(system, moment, torch.zeros_like(here)))
+            lever.append(_solve(system, moment, torch.zeros_like(here))[0])
         return LinearResponse(
             start=torch.stack(columns[:3], dim=-1),
             command=torch.stack(columns[3:], dim=-1),
@@ -121,29 +137,53 @@ def _system(
     row_residual = now.gap + drag * slip + (load * multiplier[..., None, :]).sum(-1)
     force_residual = stiffness * (pose - command) - (multiplier[..., None] * force).sum(-2)
     constraint = (now.normal_row + drag[..., None] * now.tangent_row).detach()
+    force = force.detach()
+    inverse_stiffness = 1.0 / _effective_stiffness(scene, pose, stiffness, contacts, force)
     return _System(
         force_residual=force_residual,
         row_residual=torch.where(loaded, row_residual, 0.0),
         constraint=constraint,
-        force=force.detach(),
-        inverse_stiffness=1.0 / _effective_stiffness(scene, pose, stiffness, contacts, force),
-        schur=load,
+        force=force,
+        inverse_stiffness=inverse_stiffness,
+        inverse_schur=_inverse_schur(constraint, force, inverse_stiffness, load, loaded),
         loaded=loaded,
         start_row=-(drag[..., None] * before.tangent_row * loaded[..., None]).detach(),
     )
 
 
-def _solve(system: _System, force: Tensor, row: Tensor) -> Tensor:
-    """Pose change for right-hand sides of the force balance and of the rows."""
+def _solve(system: _System, force: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
+    """Change of pose and multipliers for right-hand sides of the force balance and rows."""
     weighted = system.constraint * system.inverse_stiffness[..., None, :]
-    both = system.loaded[..., :, None] & system.loaded[..., None, :]
-    matrix = torch.where(both, weighted @ system.force.mT + system.schur, 0.0)
-    matrix = matrix + torch.diag_embed((~system.loaded).to(matrix.dtype))
     right = torch.where(system.loaded, row - (weighted * force[..., None, :]).sum(-1), 0.0)
-    multiplier, failed = torch.linalg.solve_ex(matrix, right)
-    multiplier = torch.where((failed == 0)[..., None], multiplier, 0.0)
+    multiplier = (system.inverse_schur * right[..., None, :]).sum(-1)
     push = force + (multiplier[..., None] * system.force).sum(-2)
-    return system.inverse_stiffness * push
+    return system.inverse_stiffness * push, multiplier
+
+
+def _inverse_schur(
+    constraint: Tensor, force: Tensor, inverse_stiffness: Tensor, load: Tensor, loaded: Tensor
+) -> Tensor:
+    """Inverse of the rows' 3 x 3 Schur complement, zero where it is singular."""
+    both = loaded[..., :, None] & loaded[..., None, :]
+    weighted = constraint * inverse_stiffness[..., None, :]
+    matrix = torch.where(
+        both, (weighted[..., :, None, :] * force[..., None, :, :]).sum(-1) + load, 0.0
+    )
+    matrix = matrix + torch.diag_embed((~loaded).to(matrix.dtype))
+    first, second, third = matrix.unbind(-1)
+    # Rows of the adjugate are the cross products of the columns.
+    adjugate = torch.stack(
+        (
+            torch.linalg.cross(second, third),
+            torch.linalg.cross(third, first),
+            torch.linalg.cross(first, second),
+        ),
+        dim=-2,
+    )
+    determinant = (first * adjugate[..., 0, :]).sum(-1)
+    regular = determinant.abs() > SINGULAR * matrix.abs().sum(-1).prod(-1)
+    inverse = adjugate / torch.where(regular, determinant, 1.0)[..., None, None]
+    return torch.where(regular[..., None, None], inverse, 0.0)
 
 
 def _effective_stiffness(

@@ -13,7 +13,8 @@ the answer holds for the turned outline and not only for its first linearisation
 
 With mu >= 1 an object that starts in penetration between two terrains can be jammed: no
 motion satisfies its rows. It is answered without friction, which is always possible and
-pushes it out the shortest way, and flagged RELAXED. This file works on tensors of any device; `native` is the same in compiled loops.
+pushes it out the shortest way, and flagged RELAXED. This file works on tensors of any
+device; `native` is the same in compiled loops.
 """
 
 from __future__ import annotations
@@ -21,20 +22,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tpcd.contact import ContactScene, contact_frame, terrain_gaps
+from tpcd.contact import ContactScene, contact_frame
 from tpcd.qp import ContactQP, Status, solve
-from tpcd.simulator.implicit import loaded_frames, newton_pose
+from tpcd.simulator.implicit import loaded_frames, newton_step
+from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import MAX_LOADED, ContactSet, StepSettings, StepStatus
 
 PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
 NEWTON_ROUNDS = 6
 """Rounds in which a Newton step on Coulomb's law is tried; later ones are plain fixed point."""
-SLOTS = 3 + MAX_LOADED
-"""Candidate points for each terrain: lowest now, lowest when turned either way, last loaded."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,9 @@ class Settled:
     contacts: ContactSet
     status: Int[Tensor, " b"]
     residual: Float[Tensor, " b"]
+    yielding: Bool[Tensor, " b"]
+    """Jammed even without friction: the pose yields a little to every terrain and has no
+    derivative."""
 
 
 @dataclass(frozen=True)
@@ -81,49 +84,55 @@ def _settle(
     contacts = _no_contacts(count, start)
     load = start.new_zeros(count, terrains)
     extent = scene.points_ee.norm(dim=-1).amax(-1)
-    finite = _finite(scene, start, command)
-    status[~finite] = int(StepStatus.INVALID_INPUT)
-    running = torch.nonzero(finite).flatten()
+    running = torch.arange(count, device=device)
+    part = scene
     for k in range(settings.rounds):
         if len(running) == 0:
             break
-        part = scene.gather(running)
         rows = _candidate_rows(
             part, start[running], pose[running], _take(contacts, running), load[running], settings
         )
-        step, found, relaxed = _solve_rows(
-            rows, command[running] - pose[running], stiffness
-        )
+        step, found, relaxed = _solve_rows(rows, command[running] - pose[running], stiffness)
         after = pose[running] + step
         found = _with_slip(part, start[running], after, found, settings.tolerance)
         _put(contacts, running, found)
-        load[running] = _terrain_load(found, terrains)
-        change = _motion(step, extent[running])
+        loaded_now = _terrain_load(found, terrains)
+        sinking = settings.compliance * (loaded_now - load[running]).abs().amax(-1)
+        load[running] = loaded_now
+        change = _motion(step, extent[running]) + sinking
         residual[running] = change
         settled = (change <= settings.tolerance) & ~relaxed
         if k < NEWTON_ROUNDS:
-            polished = newton_pose(
+            polished, multiplier = newton_step(
                 part, start[running], command[running], stiffness, after, found, settings
             )
             # A step beyond what this round moved comes from a wrong guess of the contacts.
             small = _motion(polished - after, extent[running]) <= 2 * change
             trusted = ~settled & ~relaxed & small
             after = torch.where(trusted[:, None], polished, after)
+            polished_load = _terrain_load(replace(found, multiplier=multiplier), terrains)
+            load[running] = torch.where(trusted[:, None], polished_load, loaded_now)
         pose[running] = after
         status[running] = torch.where(
             relaxed,
             int(StepStatus.RELAXED),
             torch.where(settled, int(StepStatus.CONVERGED), int(StepStatus.NOT_CONVERGED)),
         )
-        running = running[~settled & ~relaxed]
-    pose[~finite] = torch.nan
+        kept = torch.nonzero(~settled & ~relaxed).flatten()
+        if len(kept) < len(running):
+            running, part = running[kept], part.gather(kept)
     jammed = torch.nonzero(status == int(StepStatus.RELAXED)).flatten()
-    if len(jammed) > 0:
+    yielding = torch.zeros_like(status, dtype=torch.bool)
+    if len(jammed) > 0 and bool((scene.friction[jammed] != 0).any()):
         part = _without_friction(scene.gather(jammed))
         free = _settle(part, start[jammed], command[jammed], stiffness, settings)
         pose[jammed], residual[jammed] = free.pose, free.residual
+        yielding[jammed] = free.yielding
         _put(contacts, jammed, free.contacts)
-    return Settled(pose, contacts, status, residual)
+    elif len(jammed) > 0:
+        # Terrains that face each other jam without friction too.
+        yielding[jammed] = True
+    return Settled(pose, contacts, status, residual, yielding)
 
 
 def _without_friction(scene: ContactScene) -> ContactScene:
@@ -139,10 +148,10 @@ def _candidate_rows(
     settings: StepSettings,
 ) -> _Rows:
     """Linearise gap and slip at `pose` for the points that could carry load."""
-    gaps, levers = terrain_gaps(scene.points_ee, scene.terrains, pose)
+    candidates = _candidates(scene, start, pose, loaded, settings)
     parts = []
     for t, body in enumerate(scene.terrains):
-        index = _candidates(gaps[:, t], levers[:, t], loaded, t)
+        index = candidates[:, t]
         now = contact_frame(scene.points_ee, body, pose, index)
         before = contact_frame(scene.points_ee, body, start, index)
         friction = scene.friction[:, t, None]
@@ -163,15 +172,22 @@ def _candidate_rows(
     return _Rows(**{name: torch.cat([getattr(p, name) for p in parts], dim=1) for name in names})
 
 
-def _candidates(gap: Tensor, lever: Tensor, loaded: ContactSet, terrain: int) -> Tensor:
-    """Indices (b, SLOTS) of the points that touch first as the object sinks or turns."""
-    fresh = [
-        (gap + angle * lever).argmin(-1, keepdim=True)
-        for angle in (0.0, PROBE_ANGLE, -PROBE_ANGLE)
-    ]
-    here = (loaded.terrain == terrain) & (loaded.multiplier > 0)
-    kept = torch.where(here, loaded.point, fresh[0])
-    return torch.cat((*fresh, kept), dim=-1)
+def _candidates(
+    scene: ContactScene, start: Tensor, pose: Tensor, loaded: ContactSet, settings: StepSettings
+) -> Tensor:
+    """Indices (b, t, slots) of the points that touch first as the object sinks, turns or slips."""
+    zero = torch.zeros_like(scene.friction)
+    turned = torch.full_like(zero, PROBE_ANGLE)
+    _, index = lowest_points(scene, pose, torch.stack((zero, turned, -turned), dim=-1))
+    parts = [index]
+    if settings.friction == "anitescu":
+        # A row asks for gap + s mu slip, which need not be least where the gap is.
+        sides = torch.stack((scene.friction, -scene.friction), dim=-1)
+        parts.append(lowest_points(scene, pose, sides, start)[1])
+    terrains = torch.arange(index.shape[1], device=index.device)[:, None]
+    here = (loaded.terrain[:, None] == terrains) & (loaded.multiplier > 0)[:, None]
+    parts.append(torch.where(here, loaded.point[:, None], index[..., :1]))
+    return torch.cat(parts, dim=-1)
 
 
 def _solve_rows(
@@ -236,12 +252,6 @@ def _take(contacts: ContactSet, index: Tensor) -> ContactSet:
 def _put(contacts: ContactSet, index: Tensor, values: ContactSet) -> None:
     for name in _CONTACT_FIELDS:
         getattr(contacts, name)[index] = getattr(values, name)
-
-
-def _finite(scene: ContactScene, start: Tensor, command: Tensor) -> Tensor:
-    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
-    finite = torch.isfinite(gaps).flatten(1).all(-1) & torch.isfinite(start).all(-1)
-    return finite & torch.isfinite(command).all(-1) & torch.isfinite(scene.friction).all(-1)
 
 
 _CONTACT_FIELDS = ("multiplier", "point", "terrain", "side", "slipping")

@@ -14,17 +14,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.contact import ContactScene, terrain_gaps
+from tpcd.contact import ContactScene
 from tpcd.planar import wrap_angle
 from tpcd.simulator import native
 from tpcd.simulator.flight import FREE_GAP, Flight, first_touch, touch_row
 from tpcd.simulator.implicit import linear_response, newton_pose
+from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus, Transition
 from tpcd.simulator.settle import Settled, settle
 from tpcd.terrain import HalfPlane
 
 Engine = Literal["auto", "torch", "native"]
 DEFAULT_SETTINGS = StepSettings()
+GRAZING = 1e-9
+"""Share of the way's motion towards a terrain below which a touch only grazes it."""
 
 
 def simulate_step(
@@ -58,20 +61,25 @@ def simulate_step(
     previous = None if previous is None else previous.expand(*batch, 3).reshape(-1, 3)
     owner = torch.arange(scene.batch_shape.numel(), device=pose.device)
     owner = owner.reshape(scene.batch_shape).expand(batch).reshape(-1)
-    if _use_native(engine, scene, (pose, stiffness, command, *(() if previous is None else (previous,)))):
+    if _use_native(
+        engine, scene, (pose, stiffness, command, *(() if previous is None else (previous,)))
+    ):
         flat = native.step(scene, owner, pose, previous, command, stiffness, settings)
         _relax_jammed(flat, scene, owner, pose, previous, command, stiffness, settings)
     else:
-        flat = _step(scene.gather(owner), pose, previous, command, stiffness, settings)
+        flat = _step_finite(
+            scene.gather(owner).double(), pose.double(), previous, command, stiffness, settings
+        )
+    terrains = len(scene.terrains)
     return Transition(
         pose=flat.pose.reshape(*batch, 3),
         wrench=flat.wrench.reshape(*batch, 3),
-        mode=flat.mode.reshape(*batch, -1),
+        mode=flat.mode.reshape(*batch, terrains),
         status=flat.status.reshape(batch),
         residual=flat.residual.reshape(batch),
         pose_from_start=flat.pose_from_start.reshape(*batch, 3, 3),
-        pose_from_gap=flat.pose_from_gap.reshape(*batch, -1, 3),
-        pose_from_lever=flat.pose_from_lever.reshape(*batch, -1, 3),
+        pose_from_gap=flat.pose_from_gap.reshape(*batch, terrains, 3),
+        pose_from_lever=flat.pose_from_lever.reshape(*batch, terrains, 3),
     )
 
 
@@ -140,6 +148,36 @@ def _relax_jammed(
         getattr(flat, name)[jammed] = getattr(part, name)
 
 
+def _step_finite(
+    scene: ContactScene,
+    start: Tensor,
+    previous: Tensor | None,
+    command: Tensor,
+    stiffness: Tensor,
+    settings: StepSettings,
+) -> Transition:
+    """Step what is finite and flag the rest, which then touches no gradient of the others."""
+    given = [start, command, scene.friction, *([] if previous is None else [previous])]
+    with torch.no_grad():
+        gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
+        finite = torch.isfinite(gaps).flatten(1).all(-1)
+        finite = finite & torch.isfinite(scene.points_ee).flatten(1).all(-1)
+        for value in given:
+            finite = finite & torch.isfinite(value).all(-1)
+    if bool(finite.all()):
+        return _step(scene, start, previous, command, stiffness, settings)
+    index = torch.nonzero(finite).flatten()
+    before = None if previous is None else previous[index]
+    part = _step(scene.gather(index), start[index], before, command[index], stiffness, settings)
+    blank = {"mode": int(ContactMode.FREE), "status": int(StepStatus.INVALID_INPUT)}
+    whole = {}
+    for name, value in vars(part).items():
+        fill = blank.get(name, torch.inf if name == "residual" else torch.nan)
+        empty = value.new_full((len(start), *value.shape[1:]), fill)
+        whole[name] = empty.index_copy(0, index, value)
+    return Transition(**whole)
+
+
 @dataclass(frozen=True)
 class _State:
     """Where the object is after part of a step, with derivatives by the start of the step."""
@@ -174,8 +212,8 @@ def _step(
     begin = _start_state(scene, start)
     rested = previous is None
     if rested:
-        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
-        touching = gaps.amin(-1) <= FREE_GAP
+        gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
+        touching = gaps[..., 0] <= FREE_GAP
         path_start = start
     else:
         path_start = _unwrapped(previous.double(), start)
@@ -199,11 +237,10 @@ def _step(
         part_scene = scene.gather(index)
         state = _State(**{name: value[index] for name, value in vars(begin).items()})
         for k in range(1, settings.substeps + 1):
-            share = k / settings.substeps
-            target = path_start[index] + share * (command[index] - path_start[index])
-            state = _advance(
-                part_scene, state, target, follows * (1 - share), stiffness, settings
-            )
+            share, target = k / settings.substeps, command[index]
+            if k < settings.substeps:
+                target = path_start[index] + share * (target - path_start[index])
+            state = _advance(part_scene, state, target, follows * (1 - share), stiffness, settings)
         spread = torch.zeros_like(winding, dtype=torch.long)
         spread[index] = torch.arange(len(index), device=index.device)
         followed = _State(**{name: value[spread] for name, value in vars(state).items()})
@@ -253,17 +290,28 @@ def _advance(
     flight = first_touch(scene, state.pose, target)
     landing, by_start, by_target, by_gap = _fly(scene, state.pose, target, flight)
     settled = settle(scene, landing, target, stiffness, settings)
+    # What was answered without friction responds without it.
+    relaxed = settled.status == int(StepStatus.RELAXED)
+    if bool(relaxed.any()):
+        friction = torch.where(relaxed[:, None], 0.0, scene.friction)
+        scene = replace(scene, friction=friction)
     arguments = (scene, landing, target, stiffness, settled.pose, settled.contacts, settings)
     response = linear_response(*arguments)
-    free = flight.fraction >= 1
+    free, stands = flight.fraction >= 1, ~settled.yielding[:, None]
     landed_from_start = by_start @ state.from_start + follows * by_target
     landed_from_gap = by_gap + state.from_gap @ by_start.mT
     landed_from_lever = state.from_lever @ by_start.mT
     return _State(
-        pose=torch.where(free[:, None], target, newton_pose(*arguments)),
-        from_start=response.start @ landed_from_start + follows * response.command,
-        from_gap=response.gap + landed_from_gap @ response.start.mT,
-        from_lever=response.lever + landed_from_lever @ response.start.mT,
+        pose=torch.where(free[:, None], target, newton_pose(*arguments)).where(
+            stands, settled.pose
+        ),
+        from_start=(response.start @ landed_from_start + follows * response.command).where(
+            stands[..., None], 0.0
+        ),
+        from_gap=(response.gap + landed_from_gap @ response.start.mT).where(stands[..., None], 0.0),
+        from_lever=(response.lever + landed_from_lever @ response.start.mT).where(
+            stands[..., None], 0.0
+        ),
         mode=_contact_modes(settled, len(scene.terrains)),
         status=torch.maximum(state.status, settled.status),
         residual=torch.maximum(state.residual, settled.residual),
@@ -279,7 +327,10 @@ def _fly(
     flies = (flight.fraction > 0) & (flight.fraction < 1)
     touch = (start + fraction * way).detach()
     gap, row = touch_row(scene, start + fraction * way, flight)
-    approach = torch.where(flies, -(row.detach() * way.detach()).sum(-1), 1.0)
+    nearing = (row * way).detach()
+    # A touch that grazes has no derivative; leave out how its time changes.
+    flies = flies & (-nearing.sum(-1) > GRAZING * nearing.abs().sum(-1))
+    approach = torch.where(flies, -nearing.sum(-1), 1.0)
     # One Newton step on gap(fraction) = 0 carries the derivatives of the touching time.
     correction = torch.where(flies, gap / approach, 0.0)[:, None]
     landing = torch.where(flies[:, None], start + (fraction + correction) * way, touch)

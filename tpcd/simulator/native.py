@@ -7,7 +7,6 @@ elements that are jammed (status RELAXED) come back unanswered, for the torch pa
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from importlib.util import find_spec
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from tpcd.contact import ContactScene
 from tpcd.planar import wrap_angle
-from tpcd.simulator.record import StepSettings, StepStatus, Transition
+from tpcd.simulator.record import StepSettings, Transition
 from tpcd.terrain import HalfPlane
 
 CHUNK = 64
@@ -47,7 +46,9 @@ def step(
     settings: StepSettings,
 ) -> Transition:
     """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
-    from tpcd.simulator.kernel import step_all
+    from tpcd.simulator.kernel import Answer, Request, step_all
+    from tpcd.simulator.kernel_geometry import World
+    from tpcd.simulator.kernel_settle import Law
 
     count, terrains = len(owner), len(scene.terrains)
     planes = [body for body in scene.terrains if isinstance(body, HalfPlane)]
@@ -63,32 +64,40 @@ def step(
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
-    chunks = chunk_count(count)
     step_all(
-        points.numpy(),
-        _flat(normals, terrains, 2),
-        _flat(offsets, terrains),
-        _flat(scene.friction.detach(), terrains),
-        owner.numpy(),
-        _flat(start.detach(), 3),
-        _flat((start if previous is None else previous).detach(), 3),
-        _flat(command.detach(), 3),
-        previous is None,
-        stiffness.detach().double().numpy(),
-        settings.friction == "coulomb",
-        settings.substeps,
-        settings.follow_path,
-        settings.rounds,
-        settings.tolerance,
-        settings.compliance,
-        chunks,
-        pose.numpy(),
-        mode.numpy(),
-        status.numpy(),
-        residual.numpy(),
-        from_start.numpy(),
-        from_gap.numpy(),
-        from_lever.numpy(),
+        World(
+            points.numpy(),
+            _flat(normals, terrains, 2),
+            _flat(offsets, terrains),
+            _flat(scene.friction.detach(), terrains),
+        ),
+        Law(
+            stiffness.detach().double().numpy(),
+            stiffness.detach().double().sqrt().numpy(),
+            settings.friction == "coulomb",
+            settings.rounds,
+            settings.tolerance,
+            settings.compliance,
+        ),
+        Request(
+            owner.numpy(),
+            _flat(start.detach(), 3),
+            _flat((start if previous is None else previous).detach(), 3),
+            _flat(command.detach(), 3),
+            previous is None,
+            settings.substeps,
+            settings.follow_path,
+        ),
+        Answer(
+            pose.numpy(),
+            mode.numpy(),
+            status.numpy(),
+            residual.numpy(),
+            from_start.numpy(),
+            from_gap.numpy(),
+            from_lever.numpy(),
+        ),
+        chunk_count(count),
     )
     turn = start[:, 2].double() + wrap_angle(command[:, 2].double() - start[:, 2].double())
     target = torch.cat((command[:, :2].double(), turn[:, None]), dim=-1)

@@ -1,0 +1,400 @@
+"""Compiled search for the rest pose of one substep, and its linear response.
+
+The same model as `settle` and `implicit`: in every round the lowest points of each terrain
+join a short list of candidates, the contact problem of the list is solved, and its active
+rows give a Newton step on Coulomb's law that spares most rounds of the fixed point. All
+arrays live in one `Space`, made once for each thread; nothing is allocated inside.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from tpcd.qp.compiled import solve_whitened_3
+from tpcd.qp.problem import Status
+from tpcd.simulator.kernel_geometry import lowest_point, object_normal
+
+LIST = 8
+"""Candidate points kept for each terrain."""
+NEWTON_ROUNDS = 6
+"""Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
+PROBE = 0.02
+"""Rotation [rad] whose lowest points are candidates too, as in `settle`."""
+NEAR = 1e-4
+"""A terrain further away than this is no candidate under Coulomb friction [m]."""
+CONVERGED, NOT_CONVERGED, RELAXED, INVALID = 0, 1, 2, 3
+_SOLVED = int(Status.SOLVED)
+
+
+class Law(NamedTuple):
+    """What all elements share: impedance, its root, and the settings of the step."""
+
+    stiffness: np.ndarray
+    root: np.ndarray
+    coulomb: bool
+    rounds: int
+    tolerance: float
+    compliance: float
+
+
+class Space(NamedTuple):
+    """Everything one element works on.
+
+    Candidates of terrain t (t, LIST): `listed` who, `place` (.., 4) its coordinates in the
+    end-effector frame, its tangential position at the start and the start's tangent lever.
+    Rows of the contact problem, up to 2 t LIST of them: `rows`, `values`, `sizes`,
+    `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The three
+    rows that may carry load: `chosen` (3, 3) point (-1 where free), terrain and place,
+    `multiplier`, `side`, `slipping`. `system` (15, 3) as filled by `linear_system`.
+    """
+
+    listed: np.ndarray
+    counts: np.ndarray
+    place: np.ndarray
+    load: np.ndarray
+    before: np.ndarray
+    rows: np.ndarray
+    values: np.ndarray
+    sizes: np.ndarray
+    lengths: np.ndarray
+    multipliers: np.ndarray
+    source: np.ndarray
+    motion: np.ndarray
+    slots: np.ndarray
+    work: np.ndarray
+    system: np.ndarray
+    chosen: np.ndarray
+    multiplier: np.ndarray
+    side: np.ndarray
+    slipping: np.ndarray
+    force: np.ndarray
+    right: np.ndarray
+    change: np.ndarray
+    gain: np.ndarray
+
+
+@njit
+@no_type_check
+def new_space(terrains):
+    """Room for one element at a time against so many terrains."""
+    width = 2 * terrains * LIST
+    return Space(
+        np.zeros((terrains, LIST), np.int64),
+        np.zeros(terrains, np.int64),
+        np.zeros((terrains, LIST, 4)),
+        np.zeros(terrains),
+        np.zeros(terrains),
+        np.empty((width, 3)),
+        np.empty(width),
+        np.empty(width),
+        np.empty(width),
+        np.empty(width),
+        np.zeros((width, 2), np.int64),
+        np.empty(3),
+        np.zeros(3, np.int64),
+        np.empty((8, 3)),
+        np.empty((15, 3)),
+        np.zeros((3, 3), np.int64),
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros(3, np.bool_),
+        np.empty(3),
+        np.empty(3),
+        np.empty(3),
+        np.empty(3),
+    )
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def settle(world, o, chains, law, extent, start, command, space, pose):
+    """Settle one element; leaves pose and loaded contacts, returns status and residual."""
+    terrains = world.normals.shape[1]
+    for t in range(terrains):
+        space.counts[t] = 0
+        space.load[t] = 0.0
+    for a in range(3):
+        pose[a] = start[a]
+        space.chosen[a, 0] = -1
+        space.multiplier[a] = 0.0
+    status, residual = NOT_CONVERGED, np.inf
+    start_turn = (math.cos(start[2]), math.sin(start[2]))
+    for k in range(law.rounds):
+        turn = (math.cos(pose[2]), math.sin(pose[2]))
+        _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space)
+        m = _build_rows(world, o, law, command, pose, turn, space)
+        found, _ = solve_whitened_3(
+            space.rows, space.values, space.sizes, m, space.motion, space.multipliers,
+            space.slots, space.work,
+        )  # fmt: skip
+        if found != _SOLVED:
+            return RELAXED, np.inf
+        residual = 0.0
+        for a in range(3):
+            target = command[a] + space.motion[a] / law.root[a]
+            step = abs(target - pose[a])
+            residual = max(residual, step) if a < 2 else residual + step * extent
+            pose[a] = target
+        turn = (math.cos(pose[2]), math.sin(pose[2]))
+        residual += law.compliance * _choose(world, o, law, pose, turn, space)
+        if residual <= law.tolerance:
+            status = CONVERGED
+            break
+        if k < NEWTON_ROUNDS and linear_system(world, o, law, command, pose, turn, space):
+            for a in range(3):
+                space.force[a] = -space.system[7, a]
+                space.right[a] = -space.system[8, a]
+            respond(space)
+            step = space.change
+            # A step beyond what this round moved comes from a wrong guess of the contacts.
+            if abs(step[0]) + abs(step[1]) + abs(step[2]) * extent <= 2.0 * residual:
+                for a in range(3):
+                    pose[a] += step[a]
+                    if space.chosen[a, 0] >= 0:
+                        space.load[space.chosen[a, 1]] += space.gain[a]
+    return status, residual
+
+
+@njit(_nrt=False)
+@no_type_check
+def _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space):
+    """List the points that could carry load at a pose, in round k; turns as (cos, sin)."""
+    for t in range(world.normals.shape[1]):
+        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        u_start, v_start = object_normal(world, o, t, start_turn[0], start_turn[1])
+        if law.coulomb or k == 0:
+            low, point = lowest_point(world, o, chains, t, u, v)
+            # Coulomb friction acts only where a terrain is touched; convex friction pushes
+            # on bodies that it does not touch.
+            gap = low + nx * pose[0] + nz * pose[1] - world.offsets[o, t]
+            if law.coulomb and space.counts[t] == 0 and gap > NEAR:
+                continue
+            _add(world, o, t, point, start, u_start, v_start, space)
+        if law.coulomb:
+            continue
+        for side in range(2):
+            # At first a flat face shows both its ends; later the row of side s asks for
+            # gap + s mu slip of every point, which need not be least where the gap is.
+            sign = 1.0 - 2.0 * side
+            if k == 0:
+                du, dv = PROBE * sign * v, -PROBE * sign * u
+            else:
+                slope = world.friction[o, t] * sign
+                du, dv = slope * (v - v_start), -slope * (u - u_start)
+            _, point = lowest_point(world, o, chains, t, u + du, v + dv)
+            _add(world, o, t, point, start, u_start, v_start, space)
+
+
+@njit(_nrt=False)
+@no_type_check
+def _add(world, o, t, point, start, u_start, v_start, space):
+    """Put a point on the list of terrain t; when full it replaces the oldest."""
+    for k in range(min(space.counts[t], LIST)):
+        if space.listed[t, k] == point:
+            return
+    k = space.counts[t] % LIST
+    space.counts[t] += 1
+    space.listed[t, k] = point
+    x, z = world.points[o, 0, point], world.points[o, 1, point]
+    tangential = v_start * x - u_start * z
+    place = space.place
+    place[t, k, 0], place[t, k, 1] = x, z
+    place[t, k, 2] = (
+        tangential + world.normals[o, t, 1] * start[0] - world.normals[o, t, 0] * start[1]
+    )
+    place[t, k, 3] = -(u_start * x + v_start * z)
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def _build_rows(world, o, law, command, pose, turn, space):
+    """Unit whitened rows of all listed candidates, linearised at `pose`; returns their number."""
+    rows, values, sizes, lengths = space.rows, space.values, space.sizes, space.lengths
+    away_x, away_z, away_turn = command[0] - pose[0], command[1] - pose[1], command[2] - pose[2]
+    root_x, root_z, root_turn = 1.0 / law.root[0], 1.0 / law.root[1], 1.0 / law.root[2]
+    m = 0
+    for t in range(world.normals.shape[1]):
+        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        gap_base = nx * pose[0] + nz * pose[1] - world.offsets[o, t]
+        slip_base = nz * pose[0] - nx * pose[1]
+        sink, mu = law.compliance * space.load[t], world.friction[o, t]
+        for k in range(min(space.counts[t], LIST)):
+            x, z = space.place[t, k, 0], space.place[t, k, 1]
+            # Height and tangential position of the point over the end effector; the angle
+            # moves the one by the other.
+            height, along = u * x + v * z, v * x - u * z
+            slip = along + slip_base - space.place[t, k, 2]
+            common = gap_base + height + sink
+            if law.coulomb:
+                common += mu * abs(slip)
+            for s in range(2):
+                side = 1.0 - 2.0 * s
+                slope = side * mu
+                row_x, row_z, row_turn = nx + slope * nz, nz - slope * nx, along - slope * height
+                part_x, part_z, part_turn = row_x * away_x, row_z * away_z, row_turn * away_turn
+                values[m] = common + slope * slip + part_x + part_z + part_turn
+                sizes[m] = (
+                    abs(common) + abs(slope * slip) + abs(part_x) + abs(part_z) + abs(part_turn)
+                )
+                row_x, row_z, row_turn = row_x * root_x, row_z * root_z, row_turn * root_turn
+                rows[m, 0], rows[m, 1], rows[m, 2] = row_x, row_z, row_turn
+                lengths[m] = row_x * row_x + row_z * row_z + row_turn * row_turn
+                space.source[m, 0], space.source[m, 1] = t, 2 * k + s
+                m += 1
+    # The roots and divisions in a loop of their own, which the processor does side by side.
+    for r in range(m):
+        lengths[r] = math.sqrt(lengths[r])
+        values[r] /= lengths[r]
+        sizes[r] /= lengths[r]
+    for r in range(m):
+        inverse = 1.0 / lengths[r]
+        for a in range(3):
+            rows[r, a] *= inverse
+    return m
+
+
+@njit(_nrt=False)
+@no_type_check
+def _choose(world, o, law, pose, turn, space):
+    """Read the loaded rows off the solved problem; returns the largest change of load [N]."""
+    for t in range(world.normals.shape[1]):
+        space.before[t] = space.load[t]
+        space.load[t] = 0.0
+    for j in range(3):
+        space.chosen[j, 0] = -1
+        space.multiplier[j] = 0.0
+        r = space.slots[j]
+        if r < 0 or not space.multipliers[r] > 0.0:
+            continue
+        t, k = space.source[r, 0], space.source[r, 1] // 2
+        space.chosen[j, 0], space.chosen[j, 1], space.chosen[j, 2] = space.listed[t, k], t, k
+        space.multiplier[j] = space.multipliers[r] / space.lengths[r]
+        space.side[j] = 1.0 - 2.0 * (space.source[r, 1] % 2)
+        space.load[t] += space.multiplier[j]
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        slip = (
+            v * space.place[t, k, 0] - u * space.place[t, k, 1] - space.place[t, k, 2]
+            + world.normals[o, t, 1] * pose[0] - world.normals[o, t, 0] * pose[1]
+        )  # fmt: skip
+        space.slipping[j] = abs(slip) > 10.0 * law.tolerance
+    # A point that is held by both its sides has not slipped.
+    for j in range(3):
+        for i in range(3):
+            if (
+                j != i
+                and space.chosen[j, 0] >= 0
+                and space.chosen[j, 0] == space.chosen[i, 0]
+                and space.chosen[j, 1] == space.chosen[i, 1]
+            ):
+                space.slipping[j] = False
+    largest = 0.0
+    for t in range(world.normals.shape[1]):
+        largest = max(largest, abs(space.load[t] - space.before[t]))
+    return largest
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def linear_system(world, o, law, command, pose, turn, space):
+    """Residuals and matrices of the rest equations at `pose`, as in `implicit`.
+
+    Fills `system`: constraint rows 0-2, force rows 3-5, inverse stiffness 6, force residual
+    7, row residual 8, inverse of the Schur complement 9-11, start rows 12-14. False where
+    the complement is singular.
+    """
+    system, chosen, multiplier = space.system, space.chosen, space.multiplier
+    turning = 0.0
+    for a in range(3):
+        system[7, a] = law.stiffness[a] * (pose[a] - command[a])
+    for j in range(3):
+        system[8, j] = 0.0
+        for a in range(3):
+            system[j, a] = 0.0
+            system[3 + j, a] = 0.0
+            system[12 + j, a] = 0.0
+        if chosen[j, 0] < 0:
+            continue
+        t, k = chosen[j, 1], chosen[j, 2]
+        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        x, z = space.place[t, k, 0], space.place[t, k, 1]
+        height, along = u * x + v * z, v * x - u * z
+        slope = space.side[j] * world.friction[o, t]
+        drag = 0.0 if (law.coulomb and space.slipping[j]) else slope
+        slip = along + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
+        gap = height + nx * pose[0] + nz * pose[1] - world.offsets[o, t]
+        system[8, j] = gap + drag * slip + law.compliance * space.load[t]
+        system[j, 0], system[j, 1] = nx + drag * nz, nz - drag * nx
+        system[j, 2] = along - drag * height
+        system[3 + j, 0], system[3 + j, 1] = nx + slope * nz, nz - slope * nx
+        system[3 + j, 2] = along - slope * height
+        for a in range(3):
+            system[7, a] -= multiplier[j] * system[3 + j, a]
+        turning += multiplier[j] * (height + slope * along)
+        system[12 + j, 0], system[12 + j, 1] = -drag * nz, drag * nx
+        system[12 + j, 2] = -drag * space.place[t, k, 3]
+    system[6, 0], system[6, 1] = 1.0 / law.stiffness[0], 1.0 / law.stiffness[1]
+    system[6, 2] = 1.0 / (law.stiffness[2] + turning)
+    for j in range(3):
+        for k in range(3):
+            value = 1.0 if j == k else 0.0
+            if chosen[j, 0] >= 0 and chosen[k, 0] >= 0:
+                value = law.compliance if chosen[j, 1] == chosen[k, 1] else 0.0
+                for a in range(3):
+                    value += system[j, a] * system[6, a] * system[3 + k, a]
+            system[9 + j, k] = value
+    return _invert(system)
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def _invert(system):
+    """Invert the 3 x 3 matrix in rows 9-11 in place; False, and zeros, where it is singular."""
+    a, b, c = system[9, 0], system[9, 1], system[9, 2]
+    d, e, f = system[10, 0], system[10, 1], system[10, 2]
+    g, h, k = system[11, 0], system[11, 1], system[11, 2]
+    first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
+    determinant = a * first + b * second + c * third
+    scale = (abs(a) + abs(b) + abs(c)) * (abs(d) + abs(e) + abs(f)) * (abs(g) + abs(h) + abs(k))
+    if not abs(determinant) > 1e-12 * scale:
+        for j in range(3):
+            for i in range(3):
+                system[9 + j, i] = 0.0
+        return False
+    r = 1.0 / determinant
+    system[9, 0], system[9, 1], system[9, 2] = first * r, (c * h - b * k) * r, (b * f - c * e) * r
+    system[10, 0], system[10, 1] = second * r, (a * k - c * g) * r
+    system[10, 2], system[11, 0] = (c * d - a * f) * r, third * r
+    system[11, 1], system[11, 2] = (b * g - a * h) * r, (a * e - b * d) * r
+    return True
+
+
+@njit(_nrt=False)
+@no_type_check
+def respond(space):
+    """Pose change for the right-hand sides `force` of the balance and `right` of the rows.
+
+    Leaves it in `change`, and the change of the multipliers in `gain`; `system` must be filled.
+    """
+    system, chosen, force = space.system, space.chosen, space.force
+    m0 = m1 = m2 = 0.0
+    for j in range(3):
+        if chosen[j, 0] < 0:
+            continue
+        right = space.right[j]
+        for a in range(3):
+            right -= system[j, a] * system[6, a] * force[a]
+        m0 += system[9, j] * right
+        m1 += system[10, j] * right
+        m2 += system[11, j] * right
+    space.gain[0], space.gain[1], space.gain[2] = m0, m1, m2
+    for a in range(3):
+        # Rows of free places are zero.
+        push = force[a] + m0 * system[3, a] + m1 * system[4, a] + m2 * system[5, a]
+        space.change[a] = system[6, a] * push

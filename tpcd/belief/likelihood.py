@@ -82,6 +82,7 @@ def history_likelihood(
     error, rows = whitened[..., 0], whitened[..., 1:]
     each = -0.5 * (error**2).sum(-1) - 0.5 * log_determinant - 1.5 * math.log(2 * math.pi)
     usable = (transition.status <= int(StepStatus.RELAXED)) & torch.isfinite(each)
+    usable = usable & torch.isfinite(parameters.to_vector()).all(-1, keepdim=True)
     each = torch.where(usable, each, -torch.inf)
     total, mean, precision = _marginalise(field, each, error, rows)
     if len(history) > 1:

@@ -44,9 +44,7 @@ class StudentMixture:
         offset = (points[:, None, :] - self.mean).transpose(0, 1)
         scaled = torch.linalg.solve_triangular(self.factor, offset.mT, upper=False)
         square = (scaled**2).sum(-2)
-        constant = (
-            math.lgamma((nu + d) / 2) - math.lgamma(nu / 2) - d / 2 * math.log(nu * math.pi)
-        )
+        constant = math.lgamma((nu + d) / 2) - math.lgamma(nu / 2) - d / 2 * math.log(nu * math.pi)
         scale = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         each = constant - scale[:, None] - (nu + d) / 2 * torch.log1p(square / nu)
         return torch.logsumexp(each + self.log_share[:, None], dim=0)
@@ -68,7 +66,9 @@ def fit_student_mixture(
     mean_all = weights @ points
     centred = points - mean_all
     covariance_all = (centred * weights[:, None]).T @ centred
-    covariance_all = covariance_all + _RIDGE * torch.diag(covariance_all.diagonal().clamp_min(1e-12))
+    covariance_all = covariance_all + _RIDGE * torch.diag(
+        covariance_all.diagonal().clamp_min(1e-12)
+    )
     start = torch.multinomial(weights, components, replacement=True, generator=generator)
     mean = points[start]
     covariance = covariance_all.expand(components, d, d) / components ** (2 / d)

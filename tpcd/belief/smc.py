@@ -60,8 +60,13 @@ class SamplerSettings:
         """Refuse budgets without meaning."""
         if self.particles < 16 or not 0 < self.kept_share < 1 or self.components < 1:
             raise ValueError(
-                f"particles {self.particles} must be >= 16, kept_share {self.kept_share} in (0, 1), "
-                f"components {self.components} >= 1"
+                f"particles {self.particles} must be >= 16, kept_share {self.kept_share} in "
+                f"(0, 1), components {self.components} >= 1"
+            )
+        if not 0 <= self.least_moves <= self.most_moves or not 0 <= self.independent_share <= 1:
+            raise ValueError(
+                f"expected 0 <= least_moves ({self.least_moves}) <= most_moves "
+                f"({self.most_moves}) and independent_share ({self.independent_share}) in [0, 1]"
             )
 
 
@@ -96,9 +101,7 @@ class CloudInfo:
     """Likelihood evaluations of one particle on the whole history."""
 
 
-def start_cloud(
-    positions: Float[Tensor, "m d"], log_prior: LogDensity
-) -> Cloud:
+def start_cloud(positions: Float[Tensor, "m d"], log_prior: LogDensity) -> Cloud:
     """A cloud of draws from the prior, before any datum."""
     count, d = positions.shape
     return Cloud(
@@ -139,8 +142,16 @@ def assimilate(
         temperature += advance
         last = temperature >= 1.0
         state = _move(
-            state, mixture, spread, temperature, last, log_prior, log_likelihood, settings,
-            generator, tally,
+            state,
+            mixture,
+            spread,
+            temperature,
+            last,
+            log_prior,
+            log_likelihood,
+            settings,
+            generator,
+            tally,
         )
         tally.temperatures += 1
     cloud = replace(state.cloud, log_likelihood=state.with_datum)
@@ -247,10 +258,13 @@ def _move(
     """Metropolis-Hastings moves that leave the tempered posterior invariant."""
     still = torch.ones(len(state.before), dtype=torch.float64)
     least = settings.final_moves if last else settings.least_moves
+    share_independent = settings.independent_share
     for move in range(settings.most_moves):
         if move >= least and float(still.mean()) <= 1 - settings.moved_share:
             break
-        independent = (move % 2 == 0) == (settings.independent_share >= 0.5)
+        # Independent moves come due at their share of all moves so far, the first one first.
+        due = math.ceil((move + 1) * share_independent) - math.ceil(move * share_independent)
+        independent = due > 0
         here = state.cloud.positions
         if independent:
             proposal = mixture.sample(len(here), generator)
@@ -262,9 +276,7 @@ def _move(
         prior = log_prior(proposal)
         before, with_datum = log_likelihood(proposal)
         new = prior + before + temperature * (with_datum - before)
-        old = state.cloud.log_prior + state.before + temperature * (
-            state.with_datum - state.before
-        )
+        old = state.cloud.log_prior + state.before + temperature * (state.with_datum - state.before)
         ratio = torch.where(torch.isfinite(new), new - old + correction, -torch.inf)
         uniform = torch.rand(len(here), generator=generator, dtype=torch.float64)
         accepted = uniform.log() < ratio

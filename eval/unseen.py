@@ -117,7 +117,9 @@ def evaluate_unseen(config: Unseen) -> None:
     table = [{key: cell[key] for key in columns} for cell in cells]
     means = _means(table, priors)
     print(format_table([*table, *means]))
-    transforms = {p: [row for c in cells if c["prior"] == p for row in c["transform"]] for p in priors}
+    transforms = {
+        p: [row for c in cells if c["prior"] == p for row in c["transform"]] for p in priors
+    }
     with SummaryWriter(folder / "tensorboard") as writer:
         for prior, rows in transforms.items():
             figure = calibration(_array(rows), CHANNELS)
@@ -138,8 +140,8 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
-    from tpcd.predict import CHANNELS, ContactPredictor
     from tpcd.commands.prediction import measured_rows, predict_rows, prediction_error
+    from tpcd.predict import CHANNELS, ContactPredictor
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record
     from tpcd.truth.scene import draw_scene, make_truth

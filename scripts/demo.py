@@ -38,11 +38,6 @@ def demonstrate(config: Demo) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
     from tpcd.belief import estimate
-    from tpcd.figures.predictions import prediction as prediction_figure
-    from tpcd.figures.quality import calibration
-    from tpcd.figures.sinks import save_figure
-    from tpcd.predict import CHANNELS, ContactPredictor
-    from tpcd.results import format_table, open_run, write_results
     from tpcd.commands.estimation import KnownTruth, run_estimation
     from tpcd.commands.prediction import (
         PredictedRows,
@@ -51,6 +46,11 @@ def demonstrate(config: Demo) -> None:
         score_rows,
         write_prediction,
     )
+    from tpcd.figures.predictions import prediction as prediction_figure
+    from tpcd.figures.quality import calibration
+    from tpcd.figures.sinks import save_figure
+    from tpcd.predict import CHANNELS, ContactPredictor
+    from tpcd.results import format_table, open_run, write_results
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record, write_recording
@@ -67,7 +67,9 @@ def demonstrate(config: Demo) -> None:
     scene = draw_scene(config.outline, outlines[config.outline].vertices, generator)
     truth = make_truth(scene, kind)
     shape = load_prior(config.prior)
-    print(f"unknown object: {config.outline}; simulator of the truth: {kind}; prior: {config.prior}")
+    print(
+        f"unknown object: {config.outline}; simulator of the truth: {kind}; prior: {config.prior}"
+    )
 
     motion = make_motion("rich", scene, config.steps, generator)
     exploration = record(truth, scene, motion, config.steps, generator)

@@ -36,9 +36,9 @@ def estimate_episode(config: Estimate) -> None:
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.commands.estimation import run_estimation, summarise
     from tpcd.data import check_episode, read_episode
     from tpcd.results import format_table, open_run, write_results
-    from tpcd.commands.estimation import run_estimation, summarise
     from tpcd.shape.checkpoint import load_prior
 
     episode = read_episode(config.episode)

@@ -36,10 +36,6 @@ def predict_episodes(config: Predict) -> None:
     import torch
 
     from tpcd.belief.storage import load_belief
-    from tpcd.data import read_episode
-    from tpcd.errors import RunError
-    from tpcd.predict import ContactPredictor
-    from tpcd.results import format_table
     from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
@@ -48,6 +44,10 @@ def predict_episodes(config: Predict) -> None:
         score_rows,
         write_prediction,
     )
+    from tpcd.data import read_episode
+    from tpcd.errors import RunError
+    from tpcd.predict import ContactPredictor
+    from tpcd.results import format_table
 
     if config.out.exists() and not config.overwrite:
         raise RunError(config.out, "exists already", "choose another name or pass --overwrite")

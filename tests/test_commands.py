@@ -22,7 +22,9 @@ PRIOR = str(ROOT / "checkpoints" / "ycb21-z2")
 
 def load_script(name: str) -> ModuleType:
     """A script as a module, without running it."""
-    specification = importlib.util.spec_from_file_location(f"script_{name}", ROOT / "scripts" / f"{name}.py")
+    specification = importlib.util.spec_from_file_location(
+        f"script_{name}", ROOT / "scripts" / f"{name}.py"
+    )
     assert specification is not None and specification.loader is not None
     module = importlib.util.module_from_spec(specification)
     sys.modules[module.__name__] = module

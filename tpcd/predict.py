@@ -226,7 +226,9 @@ class ContactPredictor:
         if field.shape[-1]:
             noise = torch.randn(field.shape, generator=generator, dtype=torch.float64)
             factor = self._field_factor[chosen].mT
-            field = field + torch.linalg.solve_triangular(factor, noise[..., None], upper=True)[..., 0]
+            field = (
+                field + torch.linalg.solve_triangular(factor, noise[..., None], upper=True)[..., 0]
+            )
         here = pose.double().expand(samples, 3)
         before = None if previous is None else previous.double()
         steps = []

@@ -18,11 +18,16 @@ from torch import Tensor
 class Shape(Protocol):
     """A family of closed planar outlines indexed by a latent in [-1, 1]^z."""
 
-    latent_dim: int
-    """Size z of the latent; 0 for a fixed outline."""
-    misfit_sd: float
-    """Standard deviation of the distance between the best outline of the family and an
-    outline it has not seen [m]; 0 where the outline is exact."""
+    @property
+    def latent_dim(self) -> int:
+        """Size z of the latent; 0 for a fixed outline."""
+        ...
+
+    @property
+    def misfit_sd(self) -> float:
+        """Standard deviation of the distance between the best outline of the family and an
+        outline it has not seen [m]; 0 where the outline is exact."""
+        ...
 
     def signed_distance(
         self, points_object: Float[Tensor, "*batch p 2"], latent: Float[Tensor, "*batch z"]

@@ -1,0 +1,281 @@
+"""Simulation-based calibration of an estimator on the contact model (Talts et al. 2018).
+
+Each run draws theta from the prior, an episode given theta, and asks where theta lies in the
+posterior: its place u = P(entry < true entry | data) is uniform when the posterior is right.
+
+What is exact with the default estimator: the data come from the likelihood's own model. Each
+transition starts at the *measured* pose of the row before, the settled pose is the model's
+plus F e_start + H c + sensor noise, with the derivatives F, H of that transition, a fresh
+e_start and one draw c of the misfit field for each run, and the wrench is K (pose - command)
+plus noise. Commands depend on earlier measurements only (tpcd/truth/motions.py), which no
+posterior minds; the motion's start pose alone knows the floor and the wall (10 to 20 mm above
+the floor), and that knowledge is not in the likelihood. What is not exact: H is taken
+at the model's settled angle and not at the measured one; the robust treatment of outliers and
+of bad parity, which concerns about 1 datum in 1000 each. With `--estimator paper` the data are
+the same, while that filter assumes another noise: its ranks show what this costs.
+
+python -m eval.calibration --runs 200 --steps 10 --out runs/calibration
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tpcd.cli import run
+
+if TYPE_CHECKING:
+    import torch
+    from matplotlib.figure import Figure
+
+    from tpcd.belief.belief import EstimatorSettings
+    from tpcd.belief.prior import ParameterPrior
+    from tpcd.data.episode import Episode
+    from tpcd.shape.protocol import Shape
+
+COMMAND = "python -m eval.calibration"
+RUNS_FILE = "runs.jsonl"
+BINS = 10
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What to calibrate; a folder with runs of the same settings is continued."""
+
+    out: Path
+    """Folder for results.json, the figure, TensorBoard and one JSON line for each run."""
+    runs: int = 200
+    """Runs in total, those already in the folder included."""
+    steps: int = 10
+    """Transitions of each episode."""
+    estimator: Literal["default", "paper"] = "default"
+    """Whose posterior to check."""
+    prior: str = "ycb21-z2"
+    """Shape prior: a folder or a shipped name."""
+    quick: bool = False
+    """A built-in outline instead of the shape prior, and few particles."""
+    particles: int = 0
+    """Particles; 0 takes 1000 (default) or 5000 (paper), with --quick 300 or 1000."""
+    seed: int = 0
+    """Run r takes seed + r."""
+
+    def __post_init__(self) -> None:
+        if self.runs < 1 or self.steps < 1:
+            raise ValueError(f"runs {self.runs} and steps {self.steps} must be at least 1")
+
+
+def calibrate(config: Calibration) -> None:
+    """Check that posteriors cover what they say, over many simulated episodes."""
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+    from tqdm import tqdm
+
+    from tpcd.belief.prior import make_prior
+    from tpcd.figures import save_figure
+    from tpcd.results import format_table, write_results
+
+    torch.set_num_threads(1)
+    folder = _open_or_continue(config)
+    shape = _shape(config)
+    lines_path = folder / RUNS_FILE
+    done = read_lines(lines_path)
+    missing = [config.seed + r for r in range(config.runs) if config.seed + r not in done]
+    for seed in tqdm(missing, desc="calibration", unit="run"):
+        done[seed] = {"seed": seed, **_one_run(config, shape, seed)}
+        with lines_path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(done[seed]) + "\n")
+    places = [line["place"] for line in done.values() if "place" in line]
+    failed = len(done) - len(places)
+    if not places:
+        raise ValueError(f"all {failed} runs failed; see {lines_path}")
+    names = make_prior(shape).names
+    table = coverage_table(places, names)
+    print(format_table(table))
+    print(f"{len(places)} runs, {failed} failed; limits hold 95 % of calibrated estimators")
+    figure = rank_histograms(places, names)
+    with SummaryWriter(str(folder / "tensorboard")) as writer:
+        save_figure(figure, folder, "ranks", writer)
+        for row in table:
+            writer.add_scalar(f"coverage_90/{row['parameter']}", row["inside_90"])
+            writer.add_scalar(f"coverage_50/{row['parameter']}", row["inside_50"])
+    write_results(folder, table, seeds=sorted(done), runs=len(places), failed=failed)
+
+
+def draw_episode(
+    prior: ParameterPrior,
+    settings: EstimatorSettings,
+    steps: int,
+    generator: torch.Generator,
+) -> tuple[torch.Tensor, Episode]:
+    """Theta (d) from the prior and an episode from the likelihood's own model given theta."""
+    import torch
+
+    from tpcd.belief.belief import misfit_field
+    from tpcd.belief.misfit import misfit_rows
+    from tpcd.contact import scene_from_parameters
+    from tpcd.data.episode import Episode
+    from tpcd.parameters import SCENE_NAMES
+    from tpcd.simulator import simulate_step
+    from tpcd.truth.motions import History, rich_exploration
+    from tpcd.truth.recording import DEFAULT_SENSOR_STD
+    from tpcd.truth.scene import draw_scene
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    score = prior.sample(1, generator)
+    vector = prior.to_vector(score)[0]
+    parameters = prior.to_parameters(score[0])
+    outline = prior.shape.boundary_points(parameters.latent)
+    theta = dict(zip(SCENE_NAMES, vector[prior.shape.latent_dim :].tolist(), strict=True))
+    start = draw_scene("drawn", outline.numpy(), generator, fixed=theta)
+    scene, stiffness = scene_from_parameters(prior.shape, parameters), start.stiffness
+    field = misfit_field(prior.shape, settings)
+    coefficients = field.sd * normal(field.bumps * len(scene.terrains))
+    sensor_std = torch.tensor(DEFAULT_SENSOR_STD, dtype=torch.float64)
+    # `history_of` adds what any simulator's numerics leave to the noise of the poses.
+    pose_std = (sensor_std[:3] ** 2 + 2e-5**2).sqrt()
+    motion = rich_exploration(generator)
+    commands = start.start_pose[None].clone()
+    poses = (start.start_pose + pose_std * normal(3))[None]
+    wrenches = (sensor_std[3:] * normal(3))[None]
+    for _ in range(steps):
+        command = motion.next_command(History(commands, poses, wrenches, stiffness))
+        there = simulate_step(
+            scene, poses[-1], command, stiffness, settings.step, previous=commands[-1]
+        )
+        rows, uncovered = misfit_rows(field, there.pose[2], there)
+        values, vectors = torch.linalg.eigh(uncovered)
+        settled = there.pose + there.pose_from_start @ (pose_std * normal(3)) + rows @ coefficients
+        settled = settled + vectors @ (values.clamp_min(0.0).sqrt() * normal(3))
+        commands = torch.cat((commands, command[None]))
+        poses = torch.cat((poses, (settled + pose_std * normal(3))[None]))
+        wrench = stiffness * (settled - command) + sensor_std[3:] * normal(3)
+        wrenches = torch.cat((wrenches, wrench[None]))
+    return vector, Episode(commands, poses, wrenches, stiffness, sensor_std, object="drawn")
+
+
+def coverage_table(places: Sequence[Sequence[float]], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Coverage of central 50 and 90 % intervals, with 95 % binomial limits, and the p-value of
+    a chi-square test of uniform ranks, for each parameter."""
+    import numpy as np
+    from scipy.stats import binom, chisquare
+
+    place = np.asarray(places)
+    count = len(place)
+    table = []
+    for i, name in enumerate(names):
+        row: dict[str, Any] = {"parameter": name}
+        for level in (0.5, 0.9):
+            inside = float((np.abs(place[:, i] - 0.5) <= level / 2).mean())
+            low, high = binom.ppf([0.025, 0.975], count, level) / count
+            percent = f"{100 * level:.0f}"
+            row |= {f"inside_{percent}": inside, f"low_{percent}": low, f"high_{percent}": high}
+            row[f"within_{percent}"] = bool(low <= inside <= high)
+        counts, _ = np.histogram(place[:, i], BINS, (0.0, 1.0))
+        row["p_uniform"] = float(chisquare(counts).pvalue)
+        table.append(row)
+    return table
+
+
+def rank_histograms(places: Sequence[Sequence[float]], names: Sequence[str]) -> Figure:
+    """One histogram for each parameter, with the band that holds 95 % of calibrated counts."""
+    import numpy as np
+    from scipy.stats import binom
+
+    from tpcd.figures.style import BELIEF, panels, title
+
+    place = np.asarray(places)
+    low, high = binom.ppf([0.025, 0.975], len(place), 1 / BINS)
+    columns = 3
+    figure, axes = panels(-(-len(names) // columns), columns, 2.9, 2.0)
+    for i, (panel, name) in enumerate(zip(axes, names, strict=False)):
+        panel.axhspan(float(low), float(high), color="0.85", linewidth=0)
+        panel.hist(place[:, i], BINS, range=(0.0, 1.0), color=BELIEF, alpha=0.8)
+        panel.set_xlim(0, 1)
+        title(panel, name.replace("_", " "))
+        panel.set_xlabel("place of the truth in the posterior [–]")
+    for panel in axes[len(names) :]:
+        panel.remove()
+    return figure
+
+
+def read_lines(path: Path) -> dict[int, dict[str, Any]]:
+    """Runs done so far by seed; a last line that was cut off is dropped, in the file too."""
+    from tpcd.errors import RunError
+
+    if not path.is_file():
+        return {}
+    text = path.read_text(encoding="utf-8")
+    whole, _, rest = text.rpartition("\n")
+    if rest:
+        path.write_text(whole + "\n" if whole else "", encoding="utf-8")
+    try:
+        lines = [json.loads(line) for line in whole.splitlines()]
+        return {int(line["seed"]): line for line in lines}
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunError(path, f"is not a list of runs ({error})", "name a new folder") from error
+
+
+def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
+    """Places of the true entries in their posterior, or why there are none."""
+    import torch
+
+    from tpcd.belief.belief import EstimatorSettings, estimate
+    from tpcd.belief.paper import PaperSettings, estimate_paper
+    from tpcd.belief.prior import make_prior
+    from tpcd.belief.smc import SamplerSettings
+
+    few = {"default": 300, "paper": 1000} if config.quick else {"default": 1000, "paper": 5000}
+    particles = config.particles or few[config.estimator]
+    settings = EstimatorSettings(sampler=SamplerSettings(particles=particles))
+    generator = torch.Generator().manual_seed(seed)
+    try:
+        vector, episode = draw_episode(make_prior(shape), settings, config.steps, generator)
+        if config.estimator == "paper":
+            paper = PaperSettings(particles=particles)
+            *_, last = estimate_paper(episode, shape, generator, paper)
+        else:
+            *_, last = estimate(episode, shape, generator, settings)
+    except ValueError as error:
+        return {"failed": str(error)}
+    belief = last.belief
+    below = (belief.vectors < vector).double() + 0.5 * (belief.vectors == vector).double()
+    error = ((belief.mean() - vector) / belief.std().clamp_min(1e-12)).tolist()
+    return {"place": (belief.weights @ below).tolist(), "error_sd": error}
+
+
+def _shape(config: Calibration) -> Shape:
+    from tpcd.shape.builtin import builtin_outlines
+    from tpcd.shape.checkpoint import load_prior
+    from tpcd.shape.polygon import PolygonShape
+
+    if config.quick:
+        return PolygonShape(builtin_outlines()["mug"])
+    return load_prior(config.prior)
+
+
+def _open_or_continue(config: Calibration) -> Path:
+    """A fresh run folder, or one that holds runs of the same settings."""
+    import yaml
+
+    from tpcd.errors import RunError
+    from tpcd.results import CONFIG_FILE, open_run, to_plain
+
+    folder = config.out
+    if not (folder / CONFIG_FILE).is_file():
+        return open_run(folder, COMMAND, config)
+    before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    now = to_plain(config)
+    free = ("out", "runs")
+    differing = [key for key in now if key not in free and now[key] != before.get(key)]
+    if differing:
+        raise RunError(folder, f"holds runs of another {', '.join(differing)}", "name a new folder")
+    return folder
+
+
+if __name__ == "__main__":
+    run(calibrate, Calibration)

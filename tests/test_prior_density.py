@@ -21,12 +21,11 @@ def mixture() -> MixtureDensity:
     generator = torch.Generator().manual_seed(1)
     means = 0.5 * torch.randn(4, 3, generator=generator, dtype=torch.float64)
     factors = 0.2 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3).contiguous()
-    judge = (torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([0.3]))
     weights = torch.full((4,), 0.25, dtype=torch.float64)
-    whole = MixtureDensity(weights, means, factors, -2.0, 1.0, judge)
+    whole = MixtureDensity(weights, means, factors, -2.0, 1.0)
     draws = whole.raw_sample(200_000, generator)
     kept = float(whole.valid(draws).double().mean())
-    return MixtureDensity(weights, means, factors, -2.0, kept, judge)
+    return MixtureDensity(weights, means, factors, -2.0, kept)
 
 
 def test_mask_density_integrates_to_one(mask: MaskDensity) -> None:

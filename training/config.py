@@ -128,9 +128,9 @@ class CheckConfig:
 
     mask_cells: int = 64
     """Cells along each side of the mask of valid latents (two dimensions)."""
-    judged: int = 16000
-    """Draws of the mixture from which validity is learned (more dimensions)."""
-    draws: int = 2000
+    floor_draws: int = 3000
+    """Draws of the mixture that are decoded to find its density floor (more dimensions)."""
+    draws: int = 1500
     """Draws of the finished prior that are decoded for its card."""
 
 

@@ -21,7 +21,7 @@ from tpcd.planar import transform_points
 from tpcd.shape.deepsdf import DeepSDFShape
 from training.evaluate import MM, uniform_points
 
-STARTS, STEPS = 6, 150
+STARTS, STEPS = 4, 100
 REACH = (0.2, 0.02, 0.02, 0.2)
 """Half-ranges of scale, mount x, mount z [m] and mount angle [rad]."""
 
@@ -45,11 +45,11 @@ def best_fit(
     scene: bool = True,
 ) -> Fit:
     """Fit latent and, with `scene`, scale and mount to an outline [m]."""
-    true = torch.from_numpy(uniform_points(vertices, 240)).float()
+    true = torch.from_numpy(uniform_points(vertices, 160)).float()
     draws = torch.cat((shape.sample_latent(400, generator), shape.codes)).float()
     size = shape.boundary_points(draws).detach()
     extent = size.amax(1) - size.amin(1)
-    wanted = torch.from_numpy(np.ptp(vertices, axis=0)).float()
+    wanted = torch.tensor(np.ptp(vertices, axis=0)).float()
     nearest = (extent - wanted).abs().sum(-1).topk(40, largest=False).indices
     outlines = size[nearest]
     rough = torch.cdist(true[None].expand(len(nearest), -1, -1), outlines).amin(-1).mean(-1)
@@ -62,7 +62,7 @@ def best_fit(
     kept = (latent.detach().clone(), free.detach().clone())
     angle = torch.linspace(0, 2 * torch.pi, 61)[:-1]
     around = torch.stack((angle.cos(), angle.sin()))
-    true_support = (torch.from_numpy(vertices).float() @ around).amax(0)
+    true_support = (torch.tensor(vertices).float() @ around).amax(0)
     for _ in range(STEPS):
         placed = _placed(shape, latent, free if scene else 0 * free)
         support = ((placed @ around).amax(-2) - true_support).abs().mean(-1)

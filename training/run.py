@@ -76,7 +76,7 @@ def export_prior(
         fit_mask(network, config.check.mask_cells)
         if prepared.mixture is None
         else fit_truncated_mixture(
-            network, prepared.mixture, config.optim.seed, config.check.judged
+            network, prepared.mixture, config.optim.seed, config.check.floor_draws
         )
     )
     card: dict[str, object] = {

@@ -2,9 +2,8 @@
 
 `MaskDensity` is uniform on the valid cells of [-1, 1]^2, as in the paper but without the
 regions that decode to nothing plausible. `MixtureDensity` is a Gaussian mixture fitted to
-the latents of plausible outlines, truncated to the box, to its own high-density region and
-to where a small classifier of head outlines says yes, for latents with more dimensions,
-where a uniform box would be nearly empty of plausible outlines.
+the latents of plausible outlines, truncated to the box and to its own high-density region,
+for latents with more dimensions, where a uniform box would be nearly empty of outlines.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ class MaskDensity:
 
 @dataclass(frozen=True, eq=False)
 class MixtureDensity:
-    """Gaussian mixture cut off at the box, a density level and a judge, then normalised."""
+    """Gaussian mixture cut off at the box and at a density level, then normalised."""
 
     weights: Float[Tensor, " k"]
     """Component weights, summing to 1."""
@@ -93,9 +92,6 @@ class MixtureDensity:
     """Log of the untruncated density below which a latent is not valid."""
     kept: float
     """Probability that a draw of the untruncated mixture is valid (normalisation)."""
-    judge: tuple[Tensor, ...] = ()
-    """Weight, bias, weight, bias, ... of a perceptron with tanh between the layers; a latent
-    is valid where its output is positive. Empty: everywhere."""
 
     def raw_log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
         """Log density of the untruncated mixture."""
@@ -127,19 +123,8 @@ class MixtureDensity:
             self._valid(latent, raw), raw - math.log(self.kept), torch.full_like(raw, -torch.inf)
         )
 
-    def verdict(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
-        """Output of the judge; positive where there is none."""
-        if not self.judge:
-            return torch.ones_like(latent[..., 0])
-        value = latent.to(self.judge[0].dtype)
-        for index in range(0, len(self.judge), 2):
-            weight, bias = (part.to(latent.device) for part in self.judge[index : index + 2])
-            value = (torch.tanh(value) if index else value) @ weight.mT + bias
-        return value[..., 0].to(latent.dtype)
-
     def _valid(self, latent: Tensor, raw: Tensor) -> Tensor:
-        inside = (latent.abs() <= 1).all(-1) & (raw >= self.floor)
-        return inside & (self.verdict(latent) > 0)
+        return (latent.abs() <= 1).all(-1) & (raw >= self.floor)
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
         """Draws by rejection from the untruncated mixture."""
@@ -165,14 +150,10 @@ class MixtureDensity:
             "means": self.means.double(),
             "factors": self.factors.double(),
             "truncation": torch.tensor([self.floor, self.kept], dtype=torch.float64),
-        } | {f"judge.{index}": part for index, part in enumerate(self.judge)}
+        }
 
     @staticmethod
     def from_tensors(tensors: dict[str, Tensor]) -> MixtureDensity:
         """Inverse of `tensors`."""
         floor, kept = tensors["truncation"].tolist()
-        parts = sum(name.startswith("judge.") for name in tensors)
-        judge = tuple(tensors[f"judge.{index}"] for index in range(parts))
-        return MixtureDensity(
-            tensors["weights"], tensors["means"], tensors["factors"], floor, kept, judge
-        )
+        return MixtureDensity(tensors["weights"], tensors["means"], tensors["factors"], floor, kept)

@@ -108,9 +108,7 @@ def estimate(
     prior = make_prior(shape, episode.priors)
     history = history_of(episode)
     misfit = misfit_field(shape, settings)
-    cloud = start_cloud(
-        prior.sample(settings.sampler.particles, generator), prior.log_density
-    )
+    cloud = start_cloud(prior.sample(settings.sampler.particles, generator), prior.log_density)
     for k in range(1, len(history) + 1):
         started = time.perf_counter()
         so_far = history.first(k)

@@ -20,8 +20,24 @@ _LOG_2PI = math.log(2.0 * math.pi)
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 @no_type_check
 def evaluate_all(
-    poses, statuses, from_start, from_gap, from_lever, settled, settled_variance, start_variance,
-    values, slopes, sd, limit, worst_status, chunks, total, before, means, precisions,
+    poses,
+    statuses,
+    from_start,
+    from_gap,
+    from_lever,
+    settled,
+    settled_variance,
+    start_variance,
+    values,
+    slopes,
+    sd,
+    limit,
+    worst_status,
+    chunks,
+    total,
+    before,
+    means,
+    precisions,
 ):
     """Fill log likelihoods (m) and the field's posterior mean (m, c) and precision (m, c, c).
 
@@ -54,8 +70,16 @@ def evaluate_all(
                     continue
                 error[2] = math.pi - (math.pi - error[2]) % (2.0 * math.pi)
                 _covariances(
-                    from_start[i, k], from_gap[i, k], from_lever[i, k], settled_variance[k],
-                    start_variance[k], values[k], slopes[k], sd, covariance, marginal,
+                    from_start[i, k],
+                    from_gap[i, k],
+                    from_lever[i, k],
+                    settled_variance[k],
+                    start_variance[k],
+                    values[k],
+                    slopes[k],
+                    sd,
+                    covariance,
+                    marginal,
                 )
                 _grow(covariance, marginal, error, limit)
                 log_determinant = _factorise(covariance)
@@ -83,8 +107,16 @@ def evaluate_all(
 @njit(cache=True)
 @no_type_check
 def _covariances(
-    from_start, from_gap, from_lever, settled_variance, start_variance, values, slopes, sd,
-    covariance, marginal,
+    from_start,
+    from_gap,
+    from_lever,
+    settled_variance,
+    start_variance,
+    values,
+    slopes,
+    sd,
+    covariance,
+    marginal,
 ):
     """S of one transition without the field, and with it."""
     vv = vs = ss = 0.0

@@ -12,14 +12,14 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def evaluate_all(
+def evaluate_range(
     poses,
     statuses,
     from_start,
@@ -33,7 +33,8 @@ def evaluate_all(
     sd,
     limit,
     worst_status,
-    chunks,
+    first,
+    last,
     total,
     before,
     means,
@@ -41,67 +42,67 @@ def evaluate_all(
 ):
     """Fill log likelihoods (m) and the field's posterior mean (m, c) and precision (m, c, c).
 
+    Only particles `first` up to `last` are evaluated, so that threads can share the work.
     Model answers are (m, n, ...), measurements (n, 3), bumps (n, j); c = terrains x j.
     """
-    count, steps = statuses.shape
+    steps = statuses.shape[1]
     terrains, bumps = from_gap.shape[2], values.shape[1]
     size = terrains * bumps
-    for chunk in prange(chunks):
-        covariance, marginal = np.empty((3, 3)), np.empty((3, 3))
-        error, gap, lever = np.empty(3), np.empty((terrains, 3)), np.empty((terrains, 3))
-        vector, factor, solved = np.empty(size), np.empty((size, size)), np.empty(size)
-        for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
-            precision = precisions[i]
-            precision[:] = 0.0
-            vector[:] = 0.0
-            for a in range(size):
-                precision[a, a] = 1.0 / sd**2
-            whole = 0.0
-            before[i] = 0.0
-            for k in range(steps):
-                if k == steps - 1 and k > 0:
-                    before[i] = whole + _gain(precision, vector, factor, solved, sd)
-                usable = statuses[i, k] <= worst_status
-                for a in range(3):
-                    error[a] = settled[k, a] - poses[i, k, a]
-                    usable = usable and math.isfinite(error[a])
-                if not usable:
-                    whole = -np.inf
-                    continue
-                error[2] = math.pi - (math.pi - error[2]) % (2.0 * math.pi)
-                _covariances(
-                    from_start[i, k],
-                    from_gap[i, k],
-                    from_lever[i, k],
-                    settled_variance[k],
-                    start_variance[k],
-                    values[k],
-                    slopes[k],
-                    sd,
-                    covariance,
-                    marginal,
-                )
-                _grow(covariance, marginal, error, limit)
-                log_determinant = _factorise(covariance)
-                _forward(covariance, error)
-                square = error[0] ** 2 + error[1] ** 2 + error[2] ** 2
-                whole += -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
-                if size:
-                    for t in range(terrains):
-                        for a in range(3):
-                            gap[t, a] = from_gap[i, k, t, a]
-                            lever[t, a] = from_lever[i, k, t, a]
-                        _forward(covariance, gap[t])
-                        _forward(covariance, lever[t])
-                    _accumulate(precision, vector, gap, lever, error, values[k], slopes[k])
-            if math.isfinite(whole):
-                total[i] = whole + _gain(precision, vector, factor, solved, sd)
-            else:
-                total[i] = -np.inf
-            if not math.isfinite(before[i]):
-                before[i] = -np.inf
-            for a in range(size):
-                means[i, a] = solved[a] if math.isfinite(whole) else 0.0
+    covariance, marginal = np.empty((3, 3)), np.empty((3, 3))
+    error, gap, lever = np.empty(3), np.empty((terrains, 3)), np.empty((terrains, 3))
+    vector, factor, solved = np.empty(size), np.empty((size, size)), np.empty(size)
+    for i in range(first, last):
+        precision = precisions[i]
+        precision[:] = 0.0
+        vector[:] = 0.0
+        for a in range(size):
+            precision[a, a] = 1.0 / sd**2
+        whole = 0.0
+        before[i] = 0.0
+        for k in range(steps):
+            if k == steps - 1 and k > 0:
+                before[i] = whole + _gain(precision, vector, factor, solved, sd)
+            usable = statuses[i, k] <= worst_status
+            for a in range(3):
+                error[a] = settled[k, a] - poses[i, k, a]
+                usable = usable and math.isfinite(error[a])
+            if not usable:
+                whole = -np.inf
+                continue
+            error[2] = math.pi - (math.pi - error[2]) % (2.0 * math.pi)
+            _covariances(
+                from_start[i, k],
+                from_gap[i, k],
+                from_lever[i, k],
+                settled_variance[k],
+                start_variance[k],
+                values[k],
+                slopes[k],
+                sd,
+                covariance,
+                marginal,
+            )
+            _grow(covariance, marginal, error, limit)
+            log_determinant = _factorise(covariance)
+            _forward(covariance, error)
+            square = error[0] ** 2 + error[1] ** 2 + error[2] ** 2
+            whole += -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
+            if size:
+                for t in range(terrains):
+                    for a in range(3):
+                        gap[t, a] = from_gap[i, k, t, a]
+                        lever[t, a] = from_lever[i, k, t, a]
+                    _forward(covariance, gap[t])
+                    _forward(covariance, lever[t])
+                _accumulate(precision, vector, gap, lever, error, values[k], slopes[k])
+        if math.isfinite(whole):
+            total[i] = whole + _gain(precision, vector, factor, solved, sd)
+        else:
+            total[i] = -np.inf
+        if not math.isfinite(before[i]):
+            before[i] = -np.inf
+        for a in range(size):
+            means[i, a] = solved[a] if math.isfinite(whole) else 0.0
 
 
 @njit(cache=True)

@@ -98,7 +98,7 @@ def _detached(transition: Transition) -> bool:
 
 
 def _compiled(history: History, field: MisfitField, transition: Transition) -> HistoryLikelihood:
-    from tpcd.belief.kernel import evaluate_all
+    from tpcd.belief.kernel import evaluate_range
 
     count = len(transition.pose)
     size = field.bumps * transition.pose_from_gap.shape[-2]
@@ -106,7 +106,7 @@ def _compiled(history: History, field: MisfitField, transition: Transition) -> H
     total, before = (torch.empty(count, dtype=torch.float64) for _ in range(2))
     mean = torch.empty(count, size, dtype=torch.float64)
     precision = torch.empty(count, size, size, dtype=torch.float64)
-    evaluate_all(
+    arrays = (
         transition.pose.numpy(),
         transition.status.numpy(),
         transition.pose_from_start.numpy(),
@@ -117,14 +117,11 @@ def _compiled(history: History, field: MisfitField, transition: Transition) -> H
         history.start_variance.contiguous().numpy(),
         values.numpy(),
         slopes.numpy(),
-        field.sd,
-        OUTLIER_SQUARE,
-        int(StepStatus.RELAXED),
-        native.chunk_count(count),
-        total.numpy(),
-        before.numpy(),
-        mean.numpy(),
-        precision.numpy(),
+    )
+    scalars = (field.sd, OUTLIER_SQUARE, int(StepStatus.RELAXED))
+    answers = (total.numpy(), before.numpy(), mean.numpy(), precision.numpy())
+    native.in_parts(
+        lambda first, last: evaluate_range(*arrays, *scalars, first, last, *answers), count
     )
     return HistoryLikelihood(total, before, mean, precision)
 

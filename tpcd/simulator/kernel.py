@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from tpcd.qp import compiled
 from tpcd.simulator import kernel_geometry, kernel_settle, kernel_slopes
@@ -86,19 +86,16 @@ def _source_stamp() -> int:
     return int.from_bytes(digest.digest()[:6], "big")
 
 
-def _compile_step_all(stamp: int) -> Callable[..., None]:
+def _compile_step_range(stamp: int) -> Callable[..., None]:
     """The entry, the only function kept in numba's cache; `stamp` makes part of its key."""
 
-    @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+    @njit(cache=True, nogil=True, error_model="numpy")
     @no_type_check
-    def step_all(world, law, request, answer, chunks):
-        count = request.starts.shape[0] if stamp >= 0 else 0
-        for chunk in prange(chunks):
-            _step_range(
-                world, law, request, answer, chunk * count // chunks, (chunk + 1) * count // chunks
-            )
+    def step_range(world, law, request, answer, first, last):
+        if stamp >= 0:
+            _step_range(world, law, request, answer, first, last)
 
-    return step_all
+    return step_range
 
 
 @njit(nogil=True, error_model="numpy")
@@ -292,7 +289,7 @@ def _modes(space, modes, b):
                 modes[b, t] = slip if space.slipping[j] else 1
 
 
-step_all = _compile_step_all(_source_stamp())
+step_range = _compile_step_range(_source_stamp())
 """Step every transition, `chunks` of them side by side: (world, law, request, answer, chunks).
 
 Fills the answer in place.

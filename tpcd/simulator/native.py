@@ -7,6 +7,9 @@ elements that are jammed (status RELAXED) come back unanswered, for the torch pa
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from importlib.util import find_spec
 
 import torch
@@ -27,13 +30,24 @@ def available() -> bool:
     return find_spec("numba") is not None
 
 
-def chunk_count(count: int) -> int:
-    """Parts into which `count` elements are cut; compiled loops get torch's thread number."""
-    import numba
+def in_parts(work: Callable[[int, int], None], count: int) -> None:
+    """Call `work(first, last)` on parts of `count` elements, in as many threads as torch uses.
 
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(threads)
-    return max(1, min(8 * threads, math.ceil(count / CHUNK)))
+    The compiled loops release the interpreter lock. Threads of our own keep them apart from
+    the OpenMP of torch, whose number of threads numba's parallel loops would reset.
+    """
+    threads = min(torch.get_num_threads(), math.ceil(count / CHUNK))
+    if threads <= 1:
+        work(0, count)
+        return
+    parts = min(4 * threads, math.ceil(count / CHUNK))
+    bounds = [part * count // parts for part in range(parts + 1)]
+    list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="tpcd")
 
 
 def step(
@@ -46,7 +60,7 @@ def step(
     settings: StepSettings,
 ) -> Transition:
     """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
-    from tpcd.simulator.kernel import Answer, Request, step_all
+    from tpcd.simulator.kernel import Answer, Request, step_range
     from tpcd.simulator.kernel_geometry import World
     from tpcd.simulator.kernel_settle import Law
 
@@ -64,41 +78,39 @@ def step(
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
-    step_all(
-        World(
-            points.numpy(),
-            _flat(normals, terrains, 2),
-            _flat(offsets, terrains),
-            _flat(scene.friction.detach(), terrains),
-        ),
-        Law(
-            stiffness.detach().double().numpy(),
-            stiffness.detach().double().sqrt().numpy(),
-            settings.friction == "coulomb",
-            settings.rounds,
-            settings.tolerance,
-            settings.compliance,
-        ),
-        Request(
-            owner.numpy(),
-            _flat(start.detach(), 3),
-            _flat((start if previous is None else previous).detach(), 3),
-            _flat(command.detach(), 3),
-            previous is None,
-            settings.substeps,
-            settings.follow_path,
-        ),
-        Answer(
-            pose.numpy(),
-            mode.numpy(),
-            status.numpy(),
-            residual.numpy(),
-            from_start.numpy(),
-            from_gap.numpy(),
-            from_lever.numpy(),
-        ),
-        chunk_count(count),
+    world = World(
+        points.numpy(),
+        _flat(normals, terrains, 2),
+        _flat(offsets, terrains),
+        _flat(scene.friction.detach(), terrains),
     )
+    law = Law(
+        stiffness.detach().double().numpy(),
+        stiffness.detach().double().sqrt().numpy(),
+        settings.friction == "coulomb",
+        settings.rounds,
+        settings.tolerance,
+        settings.compliance,
+    )
+    request = Request(
+        owner.numpy(),
+        _flat(start.detach(), 3),
+        _flat((start if previous is None else previous).detach(), 3),
+        _flat(command.detach(), 3),
+        previous is None,
+        settings.substeps,
+        settings.follow_path,
+    )
+    answer = Answer(
+        pose.numpy(),
+        mode.numpy(),
+        status.numpy(),
+        residual.numpy(),
+        from_start.numpy(),
+        from_gap.numpy(),
+        from_lever.numpy(),
+    )
+    in_parts(lambda first, last: step_range(world, law, request, answer, first, last), count)
     turn = start[:, 2].double() + wrap_angle(command[:, 2].double() - start[:, 2].double())
     target = torch.cat((command[:, :2].double(), turn[:, None]), dim=-1)
     wrench = stiffness.double() * (pose - target)

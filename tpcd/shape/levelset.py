@@ -29,7 +29,7 @@ SMALLEST_SIZE, LARGEST_SIZE = 0.015, 0.36
 class LevelSet:
     """What one latent decodes to."""
 
-    closed: tuple[Float64[np.ndarray, "n 2"], ...]
+    closed: tuple[Float64[np.ndarray, "_ 2"], ...]
     """Closed curves [m], longest first; the last vertex does not repeat the first."""
     open_count: int
     """Curves that leave the searched square."""

@@ -54,9 +54,7 @@ def make_scene(
     friction, height, position = (
         torch.as_tensor(value, dtype=torch.float64) for value in (friction, height, position)
     )
-    batch = torch.broadcast_shapes(
-        friction.shape, height.shape, position.shape, points.shape[:-2]
-    )
+    batch = torch.broadcast_shapes(friction.shape, height.shape, position.shape, points.shape[:-2])
     return ContactScene(
         points_ee=points.expand(*batch, *points.shape[-2:]),
         terrains=(floor(height.expand(batch)), wall(position.expand(batch))),
@@ -122,8 +120,7 @@ def scene_wall(scene: ContactScene) -> Tensor:
 def many_random_transitions(count: int, seed: int) -> tuple[ContactScene, Tensor, Tensor]:
     """`random_transitions` of all outlines in turn, `count` for each, in one flat batch."""
     parts = [
-        random_transitions(outline_points(name), count, seed + k)
-        for k, name in enumerate(OUTLINES)
+        random_transitions(outline_points(name), count, seed + k) for k, name in enumerate(OUTLINES)
     ]
     most = max(scene.points_ee.shape[-2] for scene, _, _ in parts)
     points = [

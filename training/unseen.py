@@ -57,6 +57,7 @@ def measure_unseen(
         "best_fit_mm": vars(Spread.of(_pooled(with_scene))),
         "best_fit_latent_only_mm": vars(Spread.of(_pooled(alone))),
         "hull_rms_mm": round(misfit, 4),
+        "hull_robust_sd_mm": round(1.4826 * float(np.median(np.abs(hull))), 4),
         "mean_mm_by_outline": {
             name: round(float(fit.errors_mm.mean()), 3) for name, fit in with_scene.items()
         },

@@ -86,6 +86,7 @@ class Unseen:
 
 def evaluate_unseen(config: Unseen) -> None:
     """Estimate and predict on YCB outlines, half of them unseen, with MuJoCo as truth."""
+    import torch
     from torch.utils.tensorboard import SummaryWriter
     from tqdm import tqdm
 
@@ -95,6 +96,8 @@ def evaluate_unseen(config: Unseen) -> None:
     from tpcd.results import format_table, open_run, write_results
     from tpcd.shape.ycb import load_ycb
 
+    # Small tensor operations are fastest on one thread; the compiled loops have their own.
+    torch.set_num_threads(1)
     outlines = load_ycb("main")
     names = config.objects or (QUICK if config.quick else (*SEEN, *UNSEEN))
     priors = config.priors[:1] if config.quick else config.priors

@@ -56,6 +56,8 @@ def demonstrate(config: Demo) -> None:
     from tpcd.truth.recording import make_motion, record, write_recording
     from tpcd.truth.scene import draw_scene, make_truth
 
+    # Small tensor operations are fastest on one thread; the compiled loops have their own.
+    torch.set_num_threads(1)
     outlines = builtin_outlines()
     if config.outline not in outlines:
         raise ValueError(

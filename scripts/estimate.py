@@ -41,6 +41,8 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.results import format_table, open_run, write_results
     from tpcd.shape.checkpoint import load_prior
 
+    # Small tensor operations are fastest on one thread; the compiled loops have their own.
+    torch.set_num_threads(1)
     episode = read_episode(config.episode)
     shape = load_prior(config.prior)
     for warning in check_episode(episode):

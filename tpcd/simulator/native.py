@@ -7,6 +7,7 @@ elements that are jammed (status RELAXED) come back unanswered, for the torch pa
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -30,13 +31,22 @@ def available() -> bool:
     return find_spec("numba") is not None
 
 
+def thread_count() -> int:
+    """Threads for compiled loops: OMP_NUM_THREADS where it is set, else the usable cores."""
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    usable = getattr(os, "sched_getaffinity", None)
+    cores = len(usable(0)) if usable else os.cpu_count() or 1
+    return int(limit) if limit.isdecimal() and int(limit) > 0 else cores
+
+
 def in_parts(work: Callable[[int, int], None], count: int) -> None:
-    """Call `work(first, last)` on parts of `count` elements, in as many threads as torch uses.
+    """Call `work(first, last)` on parts of `count` elements, in as many threads as allowed.
 
     The compiled loops release the interpreter lock. Threads of our own keep them apart from
-    the OpenMP of torch, whose number of threads numba's parallel loops would reset.
+    the OpenMP of torch, whose number of threads numba's parallel loops would reset, and whose
+    threads make the small operations around these loops slow on a busy machine.
     """
-    threads = min(torch.get_num_threads(), math.ceil(count / CHUNK))
+    threads = min(thread_count(), math.ceil(count / CHUNK))
     if threads <= 1:
         work(0, count)
         return

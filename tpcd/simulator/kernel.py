@@ -290,7 +290,7 @@ def _modes(space, modes, b):
 
 
 step_range = _compile_step_range(_source_stamp())
-"""Step every transition, `chunks` of them side by side: (world, law, request, answer, chunks).
+"""Step the transitions `first` up to `last`: (world, law, request, answer, first, last).
 
-Fills the answer in place.
+Fills their part of the answer in place and releases the interpreter lock meanwhile.
 """

@@ -23,7 +23,7 @@ NAMES = ("drink_can", "banana", "juice_carton")
 ARGUMENTS = [
     f"--config={CONFIGS / 'builtin-z2.yaml'}",
     f"--data.only=[{','.join(NAMES)}]",
-    "--layout.between=300",
+    "--layout.between=200",
     "--layout.object_samples=1000",
     "--layout.between_samples=60",
     "--layout.attempts=1",
@@ -36,15 +36,16 @@ ARGUMENTS = [
     "--optim.refine_latents=200",
     "--optim.head_batch=64",
     "--optim.threads=1",
-    "--check.mask_cells=10",
-    "--check.draws=60",
+    "--check.mask_cells=8",
+    "--check.draws=40",
+    "--check.unseen=false",
 ]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run")
-    assert main([*ARGUMENTS, "--optim.steps=250", f"--out={out}"]) == 0
+    assert main([*ARGUMENTS, "--optim.steps=210", f"--out={out}"]) == 0
     return out
 
 
@@ -59,8 +60,8 @@ def test_the_prior_learns_its_outlines(run: Path) -> None:
 
 def test_the_card_tells_what_was_done(run: Path) -> None:
     card = json.loads((run / "builtin-z2" / "card.json").read_text())
-    assert card["outlines"] == [n for n in builtin_outlines() if n in NAMES]
-    assert card["configuration"]["optim"]["steps"] == 250
+    assert set(card["outlines"]) == set(NAMES)
+    assert card["configuration"]["optim"]["steps"] == 210
     assert card["training_errors_mm"]["level_set"]["mean"] < 0.8
     assert card["valid_share"] > 0.8
     assert {"torch", "numpy", "python"} <= set(card["versions"])
@@ -83,11 +84,11 @@ def test_figures_and_tensorboard_are_written(run: Path) -> None:
 
 
 def test_a_run_resumes_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # The last Lightning checkpoint of 250 steps was written at step 200.
+    # The last Lightning checkpoint of 210 steps was written at step 200.
     saved = torch.load(run / "last.ckpt", weights_only=True)
     assert saved["global_step"] > 0
-    assert main([*ARGUMENTS, "--optim.steps=260", f"--out={run}", "--resume"]) == 0
-    assert load_prior(run / "builtin-z2").card["configuration"]["optim"]["steps"] == 260
+    assert main([*ARGUMENTS, "--optim.steps=230", f"--out={run}", "--resume"]) == 0
+    assert load_prior(run / "builtin-z2").card["configuration"]["optim"]["steps"] == 230
 
 
 def test_resuming_from_nothing_is_refused_in_one_line(

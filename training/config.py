@@ -132,6 +132,8 @@ class CheckConfig:
     """Draws of the mixture that are decoded to find its density floor (more dimensions)."""
     draws: int = 1500
     """Draws of the finished prior that are decoded for its card."""
+    unseen: bool = True
+    """Fit the YCB objects that were not trained on, where their outlines are to be had."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from tpcd.shape.deepsdf import UNIT, DeepSDFShape, project
-from tpcd.shape.levelset import decode, decode_many
+from tpcd.shape.levelset import decode, decode_many, decodes_plausibly
 
 MM = 1000.0
 DIRECTIONS = 180
@@ -121,7 +121,7 @@ def support_errors(
 
 def plausible_share(shape: DeepSDFShape, latents: Float[Tensor, "count z"]) -> float:
     """Share of latents that decode to exactly one closed outline of plausible size."""
-    return float(np.mean([found.plausible for found in decode_many(shape, latents, 0.003)]))
+    return float(decodes_plausibly(shape, latents, 0.003).mean())
 
 
 def measure_prior(

@@ -102,7 +102,7 @@ def complete_card(
     shape = load_prior(folder)
     card = dict(shape.card) | measure_prior(shape, outlines, config.check.draws)
     misfit_sd = shape.misfit_sd
-    strangers = unseen_outlines(shape.names, config.data)
+    strangers = unseen_outlines(shape.names, config.data) if config.check.unseen else {}
     if config.unseen_from:
         other = load_prior(config.unseen_from)
         card["unseen"] = {"measured_with": config.unseen_from, **other.card["unseen"]}

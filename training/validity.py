@@ -17,7 +17,7 @@ from torch import Tensor
 from tpcd.errors import TpcdError
 from tpcd.shape.deepsdf import DeepSDFNetwork, DeepSDFShape
 from tpcd.shape.density import MaskDensity, MixtureDensity
-from tpcd.shape.levelset import decode_many
+from tpcd.shape.levelset import decodes_plausibly
 from training.mixture import Mixture
 
 
@@ -25,7 +25,7 @@ class TrainingError(TpcdError):
     """A training that led to no usable prior."""
 
 
-FARTHEST_HEAD = 0.003
+FARTHEST_HEAD = 0.005
 """A latent is not valid where the head strays from the level set by more than this [m]."""
 LARGEST_KNOT = 0.03
 """Nor where the head's polygon crosses itself and loses more than this share of its area."""
@@ -33,6 +33,8 @@ LEFT_OUT = 0.02
 """Least share of the mixture's draws that lie below the density floor."""
 PRECISION = 0.998
 """Share of draws above the floor that must decode to one plausible outline."""
+COMPONENT_TRIALS, COMPONENT_SHARE = 60, 0.9
+"""Draws of each component that are decoded, and how many of them must be plausible."""
 LONELY = 0.15
 """Codes whose density is below this quantile of the draws get a component of their own."""
 LONELY_SHARE = 0.06
@@ -49,7 +51,7 @@ def decodes_well(
     """One closed outline of plausible size, and the head lies on it."""
     good = head_is_sound(shape, latents)
     candidates = latents[torch.from_numpy(good)]
-    good[good] = [found.plausible for found in decode_many(shape, candidates, spacing)]
+    good[good] = decodes_plausibly(shape, candidates, spacing)
     return good
 
 
@@ -106,11 +108,12 @@ def fit_truncated_mixture(
         torch.from_numpy(part) for part in (mixture.weights, mixture.means, mixture.factors)
     )
     whole = MixtureDensity(*parts, floor=-np.inf, kept=1.0)
+    whole = without_bad_components(network, whole, generator)
     whole = with_lonely_codes(network, whole, generator)
     latents = whole.raw_sample(draws, generator)
     latents = latents[(latents.abs() <= 1).all(-1)]
     shape = DeepSDFShape(network, whole)
-    plausible = torch.tensor([found.plausible for found in decode_many(shape, latents, 0.004)])
+    plausible = torch.from_numpy(decodes_plausibly(shape, latents))
     log_density = whole.raw_log_density(latents)
     order = log_density.argsort(descending=True)
     share = plausible[order].double().cumsum(0) / torch.arange(1, len(order) + 1)
@@ -125,6 +128,26 @@ def fit_truncated_mixture(
     return MixtureDensity(whole.weights, whole.means, whole.factors, floor, kept)
 
 
+def without_bad_components(
+    network: DeepSDFNetwork, mixture: MixtureDensity, generator: torch.Generator
+) -> MixtureDensity:
+    """The mixture without components of which too many draws fail to decode.
+
+    Such a component sits on outlines with a neck too thin for the networks (rolled rims of
+    cups): each draw then comes with a separate speck.
+    """
+    count, z = mixture.means.shape
+    noise = torch.randn(count, COMPONENT_TRIALS, z, 1, generator=generator, dtype=torch.float64)
+    trials = mixture.means[:, None] + (mixture.factors[:, None] @ noise)[..., 0]
+    shape = DeepSDFShape(network, mixture)
+    good = decodes_plausibly(shape, trials.flatten(0, 1).clamp(-1, 1))
+    keep = torch.from_numpy(good.reshape(count, -1).mean(1) >= COMPONENT_SHARE)
+    if not keep.any():
+        raise TrainingError("no component decodes to closed outlines; train longer")
+    weights = mixture.weights[keep] / mixture.weights[keep].sum()
+    return MixtureDensity(weights, mixture.means[keep], mixture.factors[keep], -np.inf, 1.0)
+
+
 def with_lonely_codes(
     network: DeepSDFNetwork, mixture: MixtureDensity, generator: torch.Generator
 ) -> MixtureDensity:
@@ -137,8 +160,7 @@ def with_lonely_codes(
         len(lonely), LONELY_TRIALS, codes.shape[1], generator=generator, dtype=torch.float64
     )
     trials = (lonely[:, None] + spread * noise).flatten(0, 1)
-    found = decode_many(DeepSDFShape(network, mixture), trials, 0.004)
-    plausible = torch.tensor([level_set.plausible for level_set in found], dtype=torch.bool)
+    plausible = torch.from_numpy(decodes_plausibly(DeepSDFShape(network, mixture), trials))
     lonely = lonely[plausible.reshape(-1, LONELY_TRIALS).all(1)]
     if not len(lonely):
         return mixture

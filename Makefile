@@ -35,8 +35,8 @@ lint: $(INSTALLED) ## ruff, formatting and types
 	$(BIN)/pyright
 
 bench: $(INSTALLED) ## time the contact solvers and the filter step
-	$(BIN)/python -m eval.bench.qp
-	$(BIN)/python -m eval.bench.step
+	$(BIN)/python -m eval.bench.qp --overwrite
+	$(BIN)/python -m eval.bench.step --overwrite
 
 clean: ## remove the environment and all caches
 	rm -rf .venv build dist *.egg-info .pytest_cache .hypothesis .ruff_cache

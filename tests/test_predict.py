@@ -12,7 +12,7 @@ import torch
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.belief import Belief
-from tpcd.belief.storage import load_belief
+from tpcd.belief.storage import load_belief, save_belief
 from tpcd.errors import RunError
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
@@ -181,6 +181,18 @@ def test_a_folder_without_a_belief_is_refused_in_one_line(tmp_path: Path) -> Non
     (tmp_path / "belief.json").write_text('{"format": "tpcd-belief", "format_version": 99}')
     with pytest.raises(RunError, match="version 99, expected tpcd-belief version 1"):
         load_belief(tmp_path)
+
+
+def test_a_belief_that_was_cut_off_is_refused_in_one_line(learnt, tmp_path: Path) -> None:
+    belief, _, _ = learnt
+    save_belief(belief, tmp_path, "ycb21-z2")
+    data = tmp_path / "belief.safetensors"
+    data.write_bytes(data.read_bytes()[:100])
+    with pytest.raises(RunError, match="cannot be read .*; estimate again"):
+        load_belief(tmp_path, belief.prior.shape)
+    data.unlink()
+    with pytest.raises(RunError, match="no such file"):
+        load_belief(tmp_path, belief.prior.shape)
 
 
 def test_intervals_are_numbers(learnt) -> None:

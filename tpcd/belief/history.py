@@ -65,12 +65,11 @@ def history_of(episode: Episode, least_std: float = 2e-5) -> History:
     variance = episode.sensor_std.double() ** 2 + least_std**2
     pose_variance = variance[:3]
     wrench_variance = variance[3:] / stiffness**2
-    offset = episode.wrenches.double() / stiffness + commands - poses
-    offset = torch.cat((offset[:, :2], wrap_angle(offset[:, 2:])), dim=-1)
+    offset = _parity_offset(episode)
     weight = pose_variance / (pose_variance + wrench_variance)
     settled = poses + weight * offset
     merged = (weight * wrench_variance).expand_as(poses)
-    parity = (offset**2 / (pose_variance + wrench_variance)).sum(-1, keepdim=True)
+    parity = parity_chi_square(episode, least_std)[:, None]
     # Either sensor may be at fault; a bad row is kept with a variance that covers both.
     bad = torch.where(parity > PARITY_LIMIT, offset**2, 0.0)
     return History(
@@ -84,10 +83,15 @@ def history_of(episode: Episode, least_std: float = 2e-5) -> History:
     )
 
 
-def parity_chi_square(episode: Episode) -> Float[Tensor, " n"]:
-    """Chi-square (3 degrees of freedom) of w - K (x - u) for each row."""
-    stiffness = episode.stiffness
-    variance = (episode.sensor_std.double() ** 2).clamp_min(1e-18)
-    offset = episode.wrenches / stiffness + episode.commands - episode.poses
-    offset = torch.cat((offset[:, :2], wrap_angle(offset[:, 2:])), dim=-1)
-    return (offset**2 / (variance[:3] + variance[3:] / stiffness**2)).sum(-1)
+def parity_chi_square(episode: Episode, least_std: float = 2e-5) -> Float[Tensor, " n"]:
+    """Chi-square (3 degrees of freedom) of w - K (x - u) for each row; see `history_of`."""
+    variance = episode.sensor_std.double() ** 2 + least_std**2
+    pose_variance, wrench_variance = variance[:3], variance[3:] / episode.stiffness.double() ** 2
+    return (_parity_offset(episode) ** 2 / (pose_variance + wrench_variance)).sum(-1)
+
+
+def _parity_offset(episode: Episode) -> Tensor:
+    """Pose that the wrench tells minus the pose that was measured [m, m, rad]."""
+    told = episode.wrenches.double() / episode.stiffness.double() + episode.commands.double()
+    offset = told - episode.poses.double()
+    return torch.cat((offset[:, :2], wrap_angle(offset[:, 2:])), dim=-1)

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
@@ -80,7 +81,7 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         values = {name: tensors[name].to(torch.float64) for name in (*_TENSORS, "low", "high")}
     except FileNotFoundError as error:
         raise RunError(data, "no such file", "estimate again") from error
-    except Exception as error:  # safetensors raises its own kinds
+    except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise RunError(data, f"cannot be read ({error})", "estimate again") from error
     return Belief(
         prior=ParameterPrior(shape, values.pop("low"), values.pop("high")),

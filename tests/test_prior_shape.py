@@ -43,6 +43,14 @@ def test_a_shipped_prior_is_a_shape(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PRIORS)
+def test_the_misfit_is_the_median_of_the_unseen_outlines(name: str) -> None:
+    shape = prior(name)
+    sizes = np.array(list(shape.card["unseen"]["hull_rms_mm_by_outline"].values()))
+    assert shape.misfit_sd == pytest.approx(np.median(sizes) / 1000, rel=1e-3)
+    assert shape.card["misfit_log_std"] == pytest.approx(np.log(sizes).std(), rel=1e-2)
+
+
+@pytest.mark.parametrize("name", PRIORS)
 def test_draws_are_valid_and_decode_to_one_closed_outline(name: str) -> None:
     latents = draws(name, 200)
     shape = prior(name)

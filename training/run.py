@@ -107,10 +107,12 @@ def complete_card(
         other = load_prior(config.unseen_from)
         card["unseen"] = {"measured_with": config.unseen_from, **other.card["unseen"]}
         misfit_sd = other.misfit_sd
+        card["misfit_log_std"] = other.card["misfit_log_std"]
     elif strangers:
         report = measure_unseen(shape, strangers)
         card["unseen"] = report.figures
         misfit_sd = report.misfit_sd
+        card["misfit_log_std"] = round(report.misfit_log_std, 4)
     card["misfit_sd_m"] = misfit_sd
     save_prior(folder, shape.network, shape.density, shape.names, misfit_sd, card)
     by_outline = card["training_errors_by_outline_mean_p95_max"]

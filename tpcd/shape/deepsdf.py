@@ -109,7 +109,8 @@ class DeepSDFShape:
     names: tuple[str, ...] = ()
     """Names of the training outlines, in the order of `codes`."""
     misfit_sd: float = 0.0
-    """Standard deviation of the best-fit error at unseen outlines [m]."""
+    """Median root mean square error of the best fit to unseen outlines, as contact feels it
+    [m]; the card's `misfit_log_std` says how much its logarithm varies by object."""
     card: Mapping[str, Any] = field(default_factory=dict)
     """The checkpoint's card: configuration, errors, provenance."""
     _copies: dict[tuple[torch.device, torch.dtype], DeepSDFNetwork] = field(

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 
 from tpcd.belief.belief import EstimatorSettings, estimate
-from tpcd.belief.history import PARITY_LIMIT, history_of, parity_chi_square
+from tpcd.belief.history import PARITY_LIMIT, History, history_of, parity_chi_square
 from tpcd.belief.likelihood import (
-    OUTLIER_SQUARE,
-    _marginalise,
-    _outlier_covariance,
-    _whiten,
+    HistoryLikelihood,
+    Threshold,
+    _filter,
+    highest_terms,
     history_likelihood,
 )
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.belief.smc import SamplerSettings
+from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings
+from tpcd.simulator import StepSettings, StepStatus, native, simulate_step
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -52,37 +51,6 @@ def particles(shape: PolygonShape) -> Tensor:
     return prior.to_vector(prior.sample(12, torch.Generator().manual_seed(2)))
 
 
-def random_covariance(*batch: int, generator: torch.Generator) -> Tensor:
-    root = torch.randn(*batch, 3, 3, generator=generator, dtype=torch.float64)
-    return root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
-
-
-def test_marginal_misfit_equals_one_dense_normal_distribution() -> None:
-    generator = torch.Generator().manual_seed(0)
-    m, n, c, sd = 3, 4, 5, 0.7
-    covariance = random_covariance(m, n, generator=generator)
-    residual = torch.randn(m, n, 3, generator=generator, dtype=torch.float64)
-    rows = torch.randn(m, n, 3, c, generator=generator, dtype=torch.float64)
-    whitened, log_determinant = _whiten(covariance, torch.cat((residual[..., None], rows), -1))
-    error = whitened[..., 0]
-    each = -0.5 * error.square().sum(-1) - 0.5 * log_determinant - 1.5 * math.log(2 * math.pi)
-    total, mean, precision = _marginalise(MisfitField(sd=sd), each, error, whitened[..., 1:])
-    for i in range(m):
-        stacked = rows[i].reshape(-1, c)
-        noise = torch.block_diag(*covariance[i])
-        dense = noise + sd**2 * stacked @ stacked.T
-        flat = residual[i].flatten()
-        expected = MultivariateNormal(torch.zeros_like(flat), dense).log_prob(flat)
-        torch.testing.assert_close(total[i], expected, atol=1e-9, rtol=1e-9)
-        # The posterior of the coefficients by conditioning the joint normal distribution.
-        gain = sd**2 * stacked.T @ torch.linalg.inv(dense)
-        torch.testing.assert_close(mean[i], gain @ flat, atol=1e-9, rtol=1e-9)
-        conditional = sd**2 * torch.eye(c, dtype=torch.float64) - sd**2 * gain @ stacked
-        torch.testing.assert_close(
-            torch.linalg.inv(precision[i]), conditional, atol=1e-9, rtol=1e-9
-        )
-
-
 def test_merging_pose_and_wrench_keeps_what_a_normal_of_six_dimensions_says(
     episode: Episode,
 ) -> None:
@@ -98,7 +66,7 @@ def test_merging_pose_and_wrench_keeps_what_a_normal_of_six_dimensions_says(
         return -0.5 * (error / std).square().sum(-1)
 
     def three(settled: Tensor) -> Tensor:
-        return -0.5 * ((history.settled - settled) ** 2 / history.settled_variance).sum(-1)
+        return -0.5 * ((history.settled - settled) ** 2 / history.variance[1:]).sum(-1)
 
     good = parity_chi_square(episode)[1:] <= PARITY_LIMIT
     assert good.any()
@@ -107,30 +75,16 @@ def test_merging_pose_and_wrench_keeps_what_a_normal_of_six_dimensions_says(
     )
 
 
-def test_outliers_lie_at_the_border_whatever_the_field_carries() -> None:
-    generator = torch.Generator().manual_seed(1)
-    covariance = 1e-2 * random_covariance(2, 5, generator=generator)
-    rows = torch.randn(2, 5, 3, 4, generator=generator, dtype=torch.float64)
-    residual = 1e3 * torch.randn(2, 5, 3, generator=generator, dtype=torch.float64)
-    field = MisfitField(sd=2.0)
-    grown = covariance + _outlier_covariance(field, covariance, residual, rows)
-    marginal = grown + field.sd**2 * rows @ rows.mT
-    square = (residual * torch.linalg.solve(marginal, residual)).sum(-1)
-    torch.testing.assert_close(square, torch.full_like(square, OUTLIER_SQUARE))
-    near = 1e-3 * residual / residual.norm(dim=-1, keepdim=True)
-    assert (_outlier_covariance(field, covariance, near, rows) == 0).all()
-
-
-def test_log_likelihood_of_an_outlier_falls_with_the_logarithm_of_its_distance() -> None:
-    covariance = torch.eye(3, dtype=torch.float64).expand(1, 2, 3, 3)
-    rows = torch.zeros(1, 2, 3, 0, dtype=torch.float64)
-    residual = torch.zeros(1, 2, 3, dtype=torch.float64)
-    residual[0, 0, 0], residual[0, 1, 0] = 1e2, 1e4
-    field = MisfitField(sd=0.0)
-    grown = covariance + _outlier_covariance(field, covariance, residual, rows)
-    _, log_determinant = _whiten(grown, residual[..., None])
-    difference = float(0.5 * (log_determinant[0, 1] - log_determinant[0, 0]))
-    assert difference == pytest.approx(3 * math.log(1e2), rel=1e-6)
+def evaluate(
+    shape: PolygonShape,
+    vectors: Tensor,
+    history: History,
+    field: MisfitField = FIELD,
+    threshold: Threshold | None = None,
+) -> HistoryLikelihood:
+    sd = torch.full((len(vectors),), field.sd, dtype=torch.float64)
+    parameters = Parameters.from_vector(vectors)
+    return history_likelihood(shape, parameters, sd, history, field, StepSettings(), threshold)
 
 
 @pytest.mark.parametrize("sd", [0.0, 1e-3])
@@ -138,31 +92,93 @@ def test_before_is_the_likelihood_of_the_shorter_history(
     shape: PolygonShape, episode: Episode, particles: Tensor, sd: float
 ) -> None:
     history, field = history_of(episode), MisfitField(sd=sd)
-    parameters = Parameters.from_vector(particles)
-    whole = history_likelihood(shape, parameters, history, field, StepSettings())
-    shorter = history_likelihood(shape, parameters, history.first(5), field, StepSettings())
+    whole = evaluate(shape, particles, history, field)
+    shorter = evaluate(shape, particles, history.first(5), field)
     torch.testing.assert_close(whole.before, shorter.total)
     if sd == 0.0:
         assert whole.field_mean.shape == (12, 0)
+
+
+@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
+def test_compiled_loops_and_torch_agree(
+    shape: PolygonShape, episode: Episode, particles: Tensor
+) -> None:
+    history = history_of(episode)
+    found = evaluate(shape, particles, history)
+    scene = scene_from_parameters(shape, Parameters.from_vector(particles))
+    sd = torch.full((len(particles),), FIELD.sd, dtype=torch.float64)
+    expected = _filter(scene, sd, history, FIELD, StepSettings())
+    for name, value in vars(expected).items():
+        scale = FIELD.sd ** ("field_mean", "field_covariance").index(name) if "field" in name else 1
+        torch.testing.assert_close(getattr(found, name), value, rtol=1e-8, atol=1e-8 * scale)
+
+
+def test_no_term_exceeds_the_density_of_its_noise_at_zero(
+    shape: PolygonShape, episode: Episode, particles: Tensor
+) -> None:
+    history = history_of(episode)
+    highest = highest_terms(history)
+    totals = [evaluate(shape, particles, history.first(k)).total for k in range(1, 7)]
+    terms = torch.stack([totals[0], *(b - a for a, b in zip(totals, totals[1:], strict=False))])
+    assert (terms <= highest[:, None] + 1e-9).all()
+    assert (terms > -torch.inf).any()
+
+
+@pytest.mark.parametrize("temperature", [0.3, 1.0])
+def test_a_threshold_changes_only_what_stays_below_it(
+    shape: PolygonShape, episode: Episode, particles: Tensor, temperature: float
+) -> None:
+    history = history_of(episode)
+    plain = evaluate(shape, particles, history)
+    reached = plain.before + temperature * (plain.total - plain.before)
+    least = torch.full_like(reached, float(reached.median()))
+    least[0], least[1] = torch.inf, -torch.inf
+    found = evaluate(shape, particles, history, threshold=Threshold(least, temperature))
+    above = reached >= least
+    assert above.any() and not above.all()
+    torch.testing.assert_close(found.total[above], plain.total[above], rtol=0, atol=0)
+    torch.testing.assert_close(found.before[above], plain.before[above], rtol=0, atol=0)
+    given_up = found.total == -torch.inf
+    assert (given_up | (found.total == plain.total)).all()
+    assert given_up[0] and not given_up[1] and not (given_up & above).any()
 
 
 def test_a_nan_particle_is_impossible_and_changes_no_other(
     shape: PolygonShape, episode: Episode, particles: Tensor
 ) -> None:
     history = history_of(episode)
-    clean = history_likelihood(
-        shape, Parameters.from_vector(particles), history, FIELD, StepSettings()
-    )
+    clean = evaluate(shape, particles, history)
     broken = particles.clone()
     broken[4, 0] = torch.nan
-    found = history_likelihood(
-        shape, Parameters.from_vector(broken), history, FIELD, StepSettings()
-    )
+    found = evaluate(shape, broken, history)
     others = torch.arange(12) != 4
     assert found.total[4] == -torch.inf
     torch.testing.assert_close(found.total[others], clean.total[others], atol=0, rtol=0)
     torch.testing.assert_close(found.field_mean[others], clean.field_mean[others])
-    assert torch.isfinite(found.field_precision).all()
+    assert torch.isfinite(found.field_covariance).all()
+
+
+@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
+def test_a_jammed_particle_is_answered_like_the_torch_path(
+    shape: PolygonShape, episode: Episode
+) -> None:
+    """Friction of 1.5, and a floor and a wall that reach 10 mm into the object at its start."""
+    prior, history = make_prior(shape), history_of(episode)
+    names = prior.names
+    jammed = prior.to_vector(prior.sample(40, torch.Generator().manual_seed(2)))
+    jammed[:, names.index("friction")] = 1.5
+    points = scene_from_parameters(shape, Parameters.from_vector(jammed)).points_ee
+    at_start = points + history.start[0, :2]
+    jammed[:, names.index("floor_height")] = at_start[..., 1].amin(-1) + 0.01
+    jammed[:, names.index("wall_position")] = at_start[..., 0].amax(-1) - 0.01
+    scene = scene_from_parameters(shape, Parameters.from_vector(jammed))
+    start, command, previous = history.start[0], history.command[0], history.previous[0]
+    first = simulate_step(scene, start, command, history.stiffness, previous=previous)
+    assert (first.status == int(StepStatus.RELAXED)).any()
+    sd = torch.full((len(jammed),), FIELD.sd, dtype=torch.float64)
+    expected = _filter(scene, sd, history, FIELD, StepSettings())
+    found = evaluate(shape, jammed, history)
+    torch.testing.assert_close(found.total, expected.total, rtol=1e-8, atol=1e-8)
 
 
 def test_one_chunk_or_many_and_any_order_of_particles_agree(
@@ -171,8 +187,7 @@ def test_one_chunk_or_many_and_any_order_of_particles_agree(
     history = history_of(episode)
 
     def total(vectors: Tensor) -> Tensor:
-        parameters = Parameters.from_vector(vectors)
-        return history_likelihood(shape, parameters, history, FIELD, StepSettings()).total
+        return evaluate(shape, vectors, history).total
 
     whole = total(particles)
     torch.testing.assert_close(torch.cat([total(part) for part in particles.split(5)]), whole)

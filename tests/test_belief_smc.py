@@ -32,7 +32,7 @@ class LinearModel:
         return -0.5 * error**2 - math.log(NOISE) - 0.5 * math.log(2 * math.pi)
 
     def log_likelihood(self, before: int, count: int):
-        def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
+        def evaluate(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
             terms = self.terms(x)
             return terms[:, :before].sum(-1), terms[:, :count].sum(-1)
 
@@ -136,8 +136,8 @@ def test_one_chunk_or_many_give_the_same_cloud() -> None:
     model = LinearModel(2, seed=2)
     whole = model.log_likelihood(0, 2)
 
-    def chunked(x: Tensor) -> tuple[Tensor, Tensor]:
-        parts = [whole(part) for part in x.split(97)]
+    def chunked(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
+        parts = [whole(part, None) for part in x.split(97)]
         return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
 
     clouds = []
@@ -160,7 +160,7 @@ def test_one_chunk_or_many_give_the_same_cloud() -> None:
 def test_a_region_of_zero_likelihood_halves_the_evidence_and_holds_no_particle() -> None:
     model = LinearModel(1)
 
-    def half(x: Tensor) -> tuple[Tensor, Tensor]:
+    def half(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
         zero = torch.zeros(len(x), dtype=torch.float64)
         return zero, torch.where(x[:, 0] > 0, zero, -torch.inf)
 
@@ -179,8 +179,8 @@ def test_nan_likelihoods_count_as_zero_and_never_spread() -> None:
     model = LinearModel(2)
     whole = model.log_likelihood(0, 2)
 
-    def broken(x: Tensor) -> tuple[Tensor, Tensor]:
-        before, total = whole(x)
+    def broken(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
+        before, total = whole(x, None)
         return before, torch.where(x[:, 1] > 1.0, torch.nan, total)
 
     generator = torch.Generator().manual_seed(0)
@@ -199,7 +199,7 @@ def test_nan_likelihoods_count_as_zero_and_never_spread() -> None:
 def test_a_datum_that_nobody_explains_is_refused_in_words() -> None:
     model = LinearModel(1)
 
-    def nothing(x: Tensor) -> tuple[Tensor, Tensor]:
+    def nothing(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
         return torch.zeros(len(x)).double(), torch.full((len(x),), -torch.inf).double()
 
     start = torch.zeros(100, DIMENSION, dtype=torch.float64)
@@ -214,7 +214,7 @@ def test_a_datum_that_nobody_explains_is_refused_in_words() -> None:
 
 
 def test_an_uninformative_datum_changes_nothing_but_places() -> None:
-    def flat(x: Tensor) -> tuple[Tensor, Tensor]:
+    def flat(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
         zero = torch.zeros(len(x), dtype=torch.float64)
         return zero, zero
 

@@ -44,12 +44,14 @@ def test_drawn_data_are_likelier_under_the_truth_than_under_another_floor() -> N
     wins = 0
     for seed in range(6):
         generator = torch.Generator().manual_seed(seed)
-        vector, episode = draw_episode(prior, settings, 6, generator)
+        truth, episode = draw_episode(prior, settings, 6, generator)
+        vector, misfit_sd = truth[:-1], truth[-1:]
         moved = vector.clone()
         moved[-2] += 0.006
         found = history_likelihood(
             prior.shape,
             Parameters.from_vector(torch.stack((vector, moved))),
+            misfit_sd.expand(2),
             history_of(episode),
             field,
             settings.step,

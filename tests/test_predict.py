@@ -166,8 +166,9 @@ def test_particles_are_kept_by_weight(learnt) -> None:
             belief,
             vectors=belief.vectors[7:8],
             weights=torch.ones(1, dtype=torch.float64),
+            misfit_sd=belief.misfit_sd[7:8],
             misfit_mean=belief.misfit_mean[7:8],
-            misfit_precision=belief.misfit_precision[7:8],
+            misfit_covariance=belief.misfit_covariance[7:8],
         ),
         test,
     )
@@ -179,7 +180,7 @@ def test_a_folder_without_a_belief_is_refused_in_one_line(tmp_path: Path) -> Non
     with pytest.raises(RunError, match="no such file; give the folder that estimate wrote"):
         load_belief(tmp_path)
     (tmp_path / "belief.json").write_text('{"format": "tpcd-belief", "format_version": 99}')
-    with pytest.raises(RunError, match="version 99, expected tpcd-belief version 1"):
+    with pytest.raises(RunError, match="version 99, expected tpcd-belief version 2"):
         load_belief(tmp_path)
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from tpcd.parameters import Parameters
 from tpcd.planar import perpendicular, rotate, transform_points
 from tpcd.shape.protocol import Shape
-from tpcd.terrain import Terrain, floor, wall
+from tpcd.terrain import HalfPlane, Terrain, floor, wall
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,17 @@ def scene_from_parameters(shape: Shape, parameters: Parameters) -> ContactScene:
         points_ee=place_points(points, parameters.scale, parameters.mount),
         terrains=(floor(parameters.floor_height), wall(parameters.wall_position)),
         friction=torch.cat((friction, friction), dim=-1),
+    )
+
+
+def column_scene(scene: ContactScene) -> ContactScene:
+    """The scenes of m particles with an axis for transitions after theirs: batch (m, 1)."""
+    planes = []
+    for body in scene.terrains:
+        assert isinstance(body, HalfPlane)
+        planes.append(HalfPlane(body.direction[..., None, :], body.offset[..., None]))
+    return ContactScene(
+        scene.points_ee[..., None, :, :], tuple(planes), scene.friction[..., None, :]
     )
 
 

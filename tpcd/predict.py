@@ -16,10 +16,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.belief.belief import Belief
-from tpcd.belief.likelihood import column_scene
 from tpcd.belief.misfit import misfit_rows
 from tpcd.belief.resampling import systematic_resample
-from tpcd.contact import ContactScene, scene_from_parameters
+from tpcd.contact import ContactScene, column_scene, scene_from_parameters
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.simulator import StepStatus, simulate_step
@@ -146,9 +145,11 @@ class ContactPredictor:
         with torch.no_grad():
             scene = scene_from_parameters(belief.prior.shape, parameters)
         self._scene: ContactScene = column_scene(scene)
+        self._field_sd = belief.misfit_sd[keep]
         self._field_mean = belief.misfit_mean[keep]
-        precision = belief.misfit_precision[keep]
-        self._field_factor = torch.linalg.cholesky(precision) if precision.shape[-1] else precision
+        # The covariance may have eigenvalues of zero up to rounding, which Cholesky refuses.
+        values, vectors = torch.linalg.eigh(belief.misfit_covariance[keep])
+        self._field_root = vectors * values.clamp_min(0.0).sqrt()[:, None, :]
 
     def predict(
         self,
@@ -180,13 +181,13 @@ class ContactPredictor:
         settled = torch.cat((settled[..., :2], turn), dim=-1)
         spread = transition.pose_from_start * start_variance.sqrt()
         covariance = spread @ spread.mT + LEAST_STD**2 * torch.eye(3, dtype=torch.float64)
-        rows, uncovered = misfit_rows(self.belief.misfit, settled[..., 2].detach(), transition)
+        rows, uncovered = misfit_rows(
+            self.belief.misfit, self._field_sd[:, None], settled[..., 2].detach(), transition
+        )
         covariance = covariance + uncovered
         if rows.shape[-1]:
             settled = settled + (rows @ self._field_mean[:, None, :, None])[..., 0]
-            flat = rows.flatten(1, 2).mT
-            scaled = torch.linalg.solve_triangular(self._field_factor, flat, upper=False)
-            scaled = scaled.mT.unflatten(1, rows.shape[1:3])
+            scaled = rows @ self._field_root[:, None]
             covariance = covariance + scaled @ scaled.mT
         usable = transition.status <= int(StepStatus.RELAXED)
         usable = usable & torch.isfinite(settled).all(-1)
@@ -225,10 +226,7 @@ class ContactPredictor:
         field = self._field_mean[chosen]
         if field.shape[-1]:
             noise = torch.randn(field.shape, generator=generator, dtype=torch.float64)
-            factor = self._field_factor[chosen].mT
-            field = (
-                field + torch.linalg.solve_triangular(factor, noise[..., None], upper=True)[..., 0]
-            )
+            field = field + (self._field_root[chosen] @ noise[..., None])[..., 0]
         here = pose.double().expand(samples, 3)
         before = None if previous is None else previous.double()
         steps = []
@@ -238,7 +236,9 @@ class ContactPredictor:
                 scene, here, command, stiffness, self.belief.step, previous=before
             )
             here = transition.pose
-            rows, uncovered = misfit_rows(self.belief.misfit, here[..., 2], transition)
+            rows, uncovered = misfit_rows(
+                self.belief.misfit, self._field_sd[chosen], here[..., 2], transition
+            )
             if rows.shape[-1]:
                 here = here + (rows @ field[..., None])[..., 0]
             offset = here - command

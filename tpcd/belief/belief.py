@@ -7,6 +7,7 @@ posterior of the outline misfit; it is all that prediction needs besides the sha
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.history import History, history_of
-from tpcd.belief.likelihood import HistoryLikelihood, history_likelihood
+from tpcd.belief.likelihood import HistoryLikelihood, Threshold, history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.smc import Cloud, CloudInfo, SamplerSettings, assimilate, start_cloud
@@ -35,11 +36,14 @@ class EstimatorSettings:
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""
     misfit_sd: float | None = None
-    """Standard deviation of the outline misfit [m]; None takes the shape model's own figure."""
+    """Median of the standard deviation of the outline misfit [m] before any datum; None takes
+    the shape model's own figure."""
+    misfit_spread: float = 1.0
+    """Standard deviation of the logarithm of that standard deviation; 0 makes it known."""
     misfit_width: float = 0.15
     """How far the object turns until the outline error is another one [rad]."""
     least_misfit_sd: float = 1e-4
-    """The misfit is never taken to be less than this [m]."""
+    """The median is never taken to be less than this [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +56,12 @@ class Belief:
     weights: Float[Tensor, " m"]
     """Weights that sum to 1."""
     misfit: MisfitField
+    misfit_sd: Float[Tensor, " m"]
+    """Standard deviation of the outline misfit that each particle holds for true [m]."""
     misfit_mean: Float[Tensor, "m c"]
     """Mean of the misfit coefficients given each particle [m]."""
-    misfit_precision: Float[Tensor, "m c c"]
-    """Their precision [1/m^2]."""
+    misfit_covariance: Float[Tensor, "m c c"]
+    """Their covariance [m^2]."""
     step: StepSettings
     stiffness: Float[Tensor, " 3"]
     log_evidence: float
@@ -72,10 +78,7 @@ class Belief:
 
     def quantile(self, level: float) -> Float[Tensor, " d"]:
         """Weighted quantile of every entry of theta."""
-        ordered, order = self.vectors.sort(dim=0)
-        cumulative = self.weights[order].cumsum(0)
-        first = (cumulative >= level * cumulative[-1]).double().argmax(0)
-        return ordered.gather(0, first[None])[0]
+        return weighted_quantile(self.vectors, self.weights, level)
 
     def std(self) -> Float[Tensor, " d"]:
         """Posterior standard deviation of every entry of theta."""
@@ -108,58 +111,88 @@ def estimate(
     prior = make_prior(shape, episode.priors)
     history = history_of(episode)
     misfit = misfit_field(shape, settings)
-    cloud = start_cloud(prior.sample(settings.sampler.particles, generator), prior.log_density)
+    model = _Model(prior, misfit, settings.step)
+    cloud = start_cloud(model.sample(settings.sampler.particles, generator), model.log_prior)
     for k in range(1, len(history) + 1):
         started = time.perf_counter()
         so_far = history.first(k)
 
-        def log_likelihood(score: Tensor, so_far: History = so_far) -> tuple[Tensor, Tensor]:
-            found = _evaluate(prior, score, so_far, misfit, settings)
+        def log_likelihood(
+            score: Tensor, threshold: Threshold | None, so_far: History = so_far
+        ) -> tuple[Tensor, Tensor]:
+            found = model.evaluate(score, so_far, threshold)
             return found.before, found.total
 
         cloud, info = assimilate(
-            cloud, prior.log_density, log_likelihood, settings.sampler, generator
+            cloud, model.log_prior, log_likelihood, settings.sampler, generator
         )
-        belief = _belief(prior, cloud, so_far, misfit, settings)
+        belief = model.belief(cloud, so_far)
         yield EstimationStep(k, belief, info, time.perf_counter() - started)
 
 
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
     """The misfit field that belongs to a shape model."""
     sd = shape.misfit_sd if settings.misfit_sd is None else settings.misfit_sd
-    return MisfitField(sd=max(sd, settings.least_misfit_sd), width=settings.misfit_width)
-
-
-def _evaluate(
-    prior: ParameterPrior,
-    score: Tensor,
-    history: History,
-    misfit: MisfitField,
-    settings: EstimatorSettings,
-) -> HistoryLikelihood:
-    return history_likelihood(
-        prior.shape, prior.to_parameters(score), history, misfit, settings.step
+    return MisfitField(
+        sd=max(sd, settings.least_misfit_sd),
+        spread=settings.misfit_spread,
+        width=settings.misfit_width,
     )
 
 
-def _belief(
-    prior: ParameterPrior,
-    cloud: Cloud,
-    history: History,
-    misfit: MisfitField,
-    settings: EstimatorSettings,
-) -> Belief:
-    found = _evaluate(prior, cloud.positions, history, misfit, settings)
-    count = len(cloud.positions)
-    return Belief(
-        prior=prior,
-        vectors=prior.to_vector(cloud.positions),
-        weights=torch.full((count,), 1.0 / count, dtype=torch.float64),
-        misfit=misfit,
-        misfit_mean=found.field_mean,
-        misfit_precision=found.field_precision,
-        step=settings.step,
-        stiffness=history.stiffness,
-        log_evidence=cloud.log_evidence,
-        log_evidence_std=cloud.log_evidence_std,
-    )
+def weighted_quantile(
+    values: Float[Tensor, "m *d"], weights: Float[Tensor, " m"], level: float
+) -> Float[Tensor, "*d"]:
+    """Smallest value of each column at which the weights sum up to the level."""
+    ordered, order = values.sort(dim=0)
+    cumulative = weights[order].cumsum(0)
+    first = (cumulative >= level * cumulative[-1]).double().argmax(0)
+    return ordered.gather(0, first[None])[0]
+
+
+@dataclass(frozen=True)
+class _Model:
+    """What the sampler moves in: the scores of theta and, last, of the size of the misfit."""
+
+    prior: ParameterPrior
+    misfit: MisfitField
+    step: StepSettings
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        score = self.prior.sample(count, generator)
+        misfit = torch.randn(count, 1, generator=generator, dtype=torch.float64)
+        return torch.cat((score, misfit), dim=-1)
+
+    def log_prior(self, score: Tensor) -> Tensor:
+        normal = -0.5 * score[:, -1] ** 2 - 0.5 * math.log(2 * math.pi)
+        return self.prior.log_density(score[:, :-1]) + normal
+
+    def evaluate(
+        self, score: Tensor, history: History, threshold: Threshold | None = None
+    ) -> HistoryLikelihood:
+        return history_likelihood(
+            self.prior.shape,
+            self.prior.to_parameters(score[:, :-1]),
+            self.misfit.sd_of(score[:, -1]),
+            history,
+            self.misfit,
+            self.step,
+            threshold,
+        )
+
+    def belief(self, cloud: Cloud, history: History) -> Belief:
+        found = self.evaluate(cloud.positions, history)
+        count = len(cloud.positions)
+        return Belief(
+            prior=self.prior,
+            vectors=self.prior.to_vector(cloud.positions[:, :-1]),
+            weights=torch.full((count,), 1.0 / count, dtype=torch.float64),
+            misfit=self.misfit,
+            misfit_sd=self.misfit.sd_of(cloud.positions[:, -1]),
+            misfit_mean=found.field_mean,
+            misfit_covariance=found.field_covariance,
+            step=self.step,
+            stiffness=history.stiffness,
+            log_evidence=cloud.log_evidence,
+            log_evidence_std=cloud.log_evidence_std,
+        )

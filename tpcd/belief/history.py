@@ -23,34 +23,45 @@ PARITY_LIMIT = 16.3
 
 @dataclass(frozen=True)
 class History:
-    """n transitions: start pose measured, command, settled pose estimated.
+    """n transitions between n + 1 settled poses, each estimated from pose and wrench together.
 
-    Poses and commands (x, z, angle) [m, m, rad]; variances in their squares.
+    Poses and commands (x, z, angle) [m, m, rad]; `variance` of the poses in their squares.
     """
 
-    start: Float[Tensor, "n 3"]
-    start_variance: Float[Tensor, "n 3"]
-    previous: Float[Tensor, "n 3"]
-    """Command at which the arm rested in the start pose."""
-    command: Float[Tensor, "n 3"]
-    settled: Float[Tensor, "n 3"]
-    settled_variance: Float[Tensor, "n 3"]
+    poses: Float[Tensor, "rows 3"]
+    variance: Float[Tensor, "rows 3"]
+    commands: Float[Tensor, "rows 3"]
     stiffness: Float[Tensor, " 3"]
 
     def __len__(self) -> int:
-        """Number of transitions."""
-        return len(self.start)
+        """Number of transitions n."""
+        return len(self.poses) - 1
+
+    @property
+    def start(self) -> Float[Tensor, "n 3"]:
+        """Estimated start pose of each transition."""
+        return self.poses[:-1]
+
+    @property
+    def previous(self) -> Float[Tensor, "n 3"]:
+        """Command at which the arm rested in the start pose."""
+        return self.commands[:-1]
+
+    @property
+    def command(self) -> Float[Tensor, "n 3"]:
+        """Command of each transition."""
+        return self.commands[1:]
+
+    @property
+    def settled(self) -> Float[Tensor, "n 3"]:
+        """Estimated pose at the end of each transition."""
+        return self.poses[1:]
 
     def first(self, count: int) -> History:
         """The first transitions only."""
+        last = count + 1
         return History(
-            self.start[:count],
-            self.start_variance[:count],
-            self.previous[:count],
-            self.command[:count],
-            self.settled[:count],
-            self.settled_variance[:count],
-            self.stiffness,
+            self.poses[:last], self.variance[:last], self.commands[:last], self.stiffness
         )
 
 
@@ -72,15 +83,7 @@ def history_of(episode: Episode, least_std: float = 2e-5) -> History:
     parity = parity_chi_square(episode, least_std)[:, None]
     # Either sensor may be at fault; a bad row is kept with a variance that covers both.
     bad = torch.where(parity > PARITY_LIMIT, offset**2, 0.0)
-    return History(
-        start=poses[:-1],
-        start_variance=(pose_variance + bad)[:-1],
-        previous=commands[:-1],
-        command=commands[1:],
-        settled=settled[1:],
-        settled_variance=(merged + bad)[1:],
-        stiffness=stiffness,
-    )
+    return History(settled, merged + bad, commands, stiffness)
 
 
 def parity_chi_square(episode: Episode, least_std: float = 2e-5) -> Float[Tensor, " n"]:

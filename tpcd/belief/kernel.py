@@ -1,166 +1,263 @@
-"""The likelihood of a history in compiled loops, one particle after the other.
+"""The history likelihood in compiled loops, one particle after the other.
 
-The same formulas as `likelihood`, without a temporary in memory: a settled pose answers the
-misfit field through two vectors for each terrain, gap g and lever l, so that the 3 x c rows
-H are g b^T + l s^T with the values b and slopes s of the bumps, and every product with H
-splits into products of 3-vectors and of bumps. Imported only where numba is.
+The same formulas as `kalman` and `likelihood`, with the steps of `tpcd.simulator.kernel`: a
+particle steps a transition, filters its residual, and is given up as soon as it cannot reach
+its threshold any more. Nothing is allocated for each particle. Imported only where numba is.
 """
 
 from __future__ import annotations
 
 import math
-from typing import no_type_check
+import sys
+from collections.abc import Callable
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from numba import njit
 
+from tpcd.simulator.kernel import Answer, Request, prepare, source_stamp, step_element
+from tpcd.simulator.kernel_geometry import new_chains
+from tpcd.simulator.kernel_settle import RELAXED, new_space
+from tpcd.simulator.kernel_slopes import new_slopes
+
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def evaluate_range(
-    poses,
-    statuses,
-    from_start,
-    from_gap,
-    from_lever,
-    settled,
-    settled_variance,
-    start_variance,
-    values,
-    slopes,
-    sd,
-    limit,
-    worst_status,
-    first,
-    last,
-    total,
-    before,
-    means,
-    precisions,
-):
-    """Fill log likelihoods (m) and the field's posterior mean (m, c) and precision (m, c, c).
+class Measured(NamedTuple):
+    """What is known and asked of m particles over n transitions.
 
-    Only particles `first` up to `last` are evaluated, so that threads can share the work.
-    Model answers are (m, n, ...), measurements (n, 3), bumps (n, j); c = terrains x j.
+    `poses` (n + 1, 3) and their `variance`; values and `slopes` (n, j) of the bumps; `rest`
+    (n) what the terms after each one can still add; `least` (m) what must be reached with the
+    last term at `temperature`; `sd` (m) of the misfit; `limit` of an innovation's square.
     """
-    steps = statuses.shape[1]
-    terrains, bumps = from_gap.shape[2], values.shape[1]
-    size = terrains * bumps
-    covariance, marginal = np.empty((3, 3)), np.empty((3, 3))
-    error, gap, lever = np.empty(3), np.empty((terrains, 3)), np.empty((terrains, 3))
-    vector, factor, solved = np.empty(size), np.empty((size, size)), np.empty(size)
+
+    poses: np.ndarray
+    variance: np.ndarray
+    bumps: np.ndarray
+    slopes: np.ndarray
+    rest: np.ndarray
+    least: np.ndarray
+    temperature: float
+    sd: np.ndarray
+    limit: float
+
+
+class Found(NamedTuple):
+    """Where the answers go: log likelihoods (m), field mean (m, c) and covariance (m, c, c)."""
+
+    total: np.ndarray
+    before: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    jammed: np.ndarray
+
+
+class Filter(NamedTuple):
+    """The state of one particle's filter and what one transition needs; s = c + 3."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    design: np.ndarray
+    cross: np.ndarray
+    factor: np.ndarray
+    innovation: np.ndarray
+
+
+def _compile_explain_range(stamp: int) -> Callable[..., None]:
+    """The entry, the only function kept in numba's cache; `stamp` makes part of its key."""
+
+    @njit(cache=True, nogil=True, error_model="numpy")
+    @no_type_check
+    def explain_range(world, law, request, measured, found, first, last):
+        if stamp >= 0:
+            _explain_range(world, law, request, measured, found, first, last)
+
+    return explain_range
+
+
+@njit(nogil=True, error_model="numpy")
+@no_type_check
+def _explain_range(world, law, request, measured, found, first, last):
+    """Evaluate the particles from `first` up to `last`."""
+    terrains, count = world.normals.shape[1], world.points.shape[2]
+    steps, size = measured.rest.shape[0], found.mean.shape[1]
+    chains, space, slopes = new_chains(terrains, count), new_space(terrains), new_slopes(terrains)
+    poses = np.zeros((7, 3))
+    answer = Answer(
+        np.zeros((steps, 3)),
+        np.zeros((steps, terrains), np.int64),
+        np.zeros(steps, np.int64),
+        np.zeros(steps),
+        np.zeros((steps, 3, 3)),
+        np.zeros((steps, terrains, 3)),
+        np.zeros((steps, terrains, 3)),
+    )
+    state = Filter(
+        np.zeros(size + 3),
+        np.zeros((size + 3, size + 3)),
+        np.zeros((3, size + 3)),
+        np.zeros((size + 3, 3)),
+        np.zeros((3, 3)),
+        np.zeros(3),
+    )
+    # Each particle starts its transitions at poses of its own.
+    starts = request.starts.copy()
+    request = Request(
+        request.owner,
+        starts,
+        request.previous,
+        request.commands,
+        request.rested,
+        request.substeps,
+        request.follow_path,
+    )
     for i in range(first, last):
-        precision = precisions[i]
-        precision[:] = 0.0
-        vector[:] = 0.0
-        for a in range(size):
-            precision[a, a] = 1.0 / sd**2
-        whole = 0.0
-        before[i] = 0.0
+        found.total[i] = found.before[i] = -np.inf
+        if not math.isfinite(measured.sd[i]) or not measured.least[i] < np.inf:
+            continue
+        extent = prepare(world, i, law, request, 0, steps, chains)
+        _begin(state, measured, measured.sd[i])
+        before = total = 0.0
         for k in range(steps):
-            if k == steps - 1 and k > 0:
-                before[i] = whole + _gain(precision, vector, factor, solved, sd)
-            usable = statuses[i, k] <= worst_status
             for a in range(3):
-                error[a] = settled[k, a] - poses[i, k, a]
-                usable = usable and math.isfinite(error[a])
-            if not usable:
-                whole = -np.inf
-                continue
-            error[2] = math.pi - (math.pi - error[2]) % (2.0 * math.pi)
-            _covariances(
-                from_start[i, k],
-                from_gap[i, k],
-                from_lever[i, k],
-                settled_variance[k],
-                start_variance[k],
-                values[k],
-                slopes[k],
-                sd,
-                covariance,
-                marginal,
-            )
-            _grow(covariance, marginal, error, limit)
-            log_determinant = _factorise(covariance)
-            _forward(covariance, error)
-            square = error[0] ** 2 + error[1] ** 2 + error[2] ** 2
-            whole += -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
-            if size:
-                for t in range(terrains):
-                    for a in range(3):
-                        gap[t, a] = from_gap[i, k, t, a]
-                        lever[t, a] = from_lever[i, k, t, a]
-                    _forward(covariance, gap[t])
-                    _forward(covariance, lever[t])
-                _accumulate(precision, vector, gap, lever, error, values[k], slopes[k])
-        if math.isfinite(whole):
-            total[i] = whole + _gain(precision, vector, factor, solved, sd)
-        else:
-            total[i] = -np.inf
-        if not math.isfinite(before[i]):
-            before[i] = -np.inf
+                starts[k, a] = measured.poses[k, a] - state.mean[size + a]
+            step_element(world, i, chains, law, extent, request, k, answer, space, slopes, poses)
+            if answer.statuses[k] == RELAXED:
+                found.jammed[i] = True
+                break
+            before = total
+            total += _assimilate(state, measured, answer, k, measured.sd[i])
+            share = measured.temperature if k == steps - 1 else 1.0
+            reach = before + share * (total - before) + measured.rest[k]
+            if not (reach >= measured.least[i] and math.isfinite(total)):
+                before = total = -np.inf
+                break
+        if found.jammed[i]:
+            continue
+        found.total[i], found.before[i] = total, before
         for a in range(size):
-            means[i, a] = solved[a] if math.isfinite(whole) else 0.0
+            found.mean[i, a] = state.mean[a]
+            for b in range(size):
+                found.covariance[i, a, b] = state.covariance[a, b]
 
 
-@njit(cache=True)
+@njit(_nrt=False)
 @no_type_check
-def _covariances(
-    from_start,
-    from_gap,
-    from_lever,
-    settled_variance,
-    start_variance,
-    values,
-    slopes,
-    sd,
-    covariance,
-    marginal,
-):
-    """S of one transition without the field, and with it."""
-    vv = vs = ss = 0.0
-    for j in range(values.shape[0]):
-        vv += values[j] * values[j]
-        vs += values[j] * slopes[j]
-        ss += slopes[j] * slopes[j]
-    uncovered = max(0.0, 1.0 - vv) * sd * sd
+def _begin(state, measured, sd):
+    """The state before any transition."""
+    width = state.mean.shape[0]
+    for a in range(width):
+        state.mean[a] = 0.0
+        for b in range(width):
+            state.covariance[a, b] = 0.0
+        state.covariance[a, a] = sd * sd if a < width - 3 else measured.variance[0, a - width + 3]
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def _assimilate(state, measured, answer, k, sd):
+    """Filter the residual of transition k; returns its log density, -inf where it has none."""
+    mean, covariance, design = state.mean, state.covariance, state.design
+    cross, factor, innovation = state.cross, state.factor, state.innovation
+    width = mean.shape[0]
+    size, variance = width - 3, measured.variance
+    total = 0.0
     for a in range(3):
-        for b in range(3):
-            own = settled_variance[a] if a == b else 0.0
-            for k in range(3):
-                own += from_start[a, k] * from_start[b, k] * start_variance[k]
-            field = 0.0
-            for t in range(from_gap.shape[0]):
-                ga, gb, la, lb = from_gap[t, a], from_gap[t, b], from_lever[t, a], from_lever[t, b]
-                own += uncovered * ga * gb
-                field += vv * ga * gb + vs * (ga * lb + la * gb) + ss * la * lb
-            covariance[a, b] = own
-            marginal[a, b] = own + sd * sd * field
-
-
-@njit(cache=True)
-@no_type_check
-def _grow(covariance, marginal, error, limit):
-    """Add to S what puts an unexplained residual at the limit."""
-    factor, whitened = marginal.copy(), error.copy()
-    _factorise(factor)
-    _forward(factor, whitened)
-    square = whitened[0] ** 2 + whitened[1] ** 2 + whitened[2] ** 2
-    if square > limit:
+        innovation[a] = measured.poses[k + 1, a] - answer.poses[k, a]
+        total += innovation[a]
+    if answer.statuses[k] > RELAXED or not math.isfinite(total):
+        return -np.inf
+    innovation[2] = math.pi - (math.pi - innovation[2]) % (2.0 * math.pi)
+    _fill_design(design, measured, answer, k, size)
+    for s in range(width):
         for a in range(3):
-            for b in range(3):
-                covariance[a, b] += (square / limit - 1.0) * marginal[a, b]
+            value = 0.0
+            for r in range(width):
+                value += covariance[s, r] * design[a, r]
+            cross[s, a] = value
+    uncovered = 1.0
+    for j in range(measured.bumps.shape[1]):
+        uncovered -= measured.bumps[k, j] ** 2
+    uncovered = max(uncovered, 0.0) * sd * sd if size > 0 else 0.0
+    for a in range(3):
+        for r in range(size):
+            innovation[a] -= design[a, r] * mean[r]
+        for b in range(a + 1):
+            value = variance[k + 1, a] if a == b else 0.0
+            for t in range(answer.from_gap.shape[1]):
+                value += uncovered * answer.from_gap[k, t, a] * answer.from_gap[k, t, b]
+            for r in range(width):
+                value += design[a, r] * cross[r, b]
+            factor[a, b] = value
+    log_determinant = _factorise(factor)
+    _forward(factor, innovation)
+    square = innovation[0] ** 2 + innovation[1] ** 2 + innovation[2] ** 2
+    if square > measured.limit:
+        # Growing the covariance by a number stretches its factor by the root.
+        growth = square / measured.limit
+        root = math.sqrt(growth)
+        for a in range(3):
+            innovation[a] /= root
+            for b in range(a + 1):
+                factor[a, b] *= root
+        log_determinant += 3.0 * math.log(growth)
+        square = measured.limit
+    _advance(state, variance, k, size)
+    return -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
 
 
-@njit(cache=True)
+@njit(_nrt=False)
+@no_type_check
+def _fill_design(design, measured, answer, k, size):
+    """How the residual of transition k answers the field's coefficients and the start's error."""
+    bumps = measured.bumps.shape[1]
+    for a in range(3):
+        for t in range(answer.from_gap.shape[1]):
+            gap, lever = answer.from_gap[k, t, a], answer.from_lever[k, t, a]
+            for j in range(bumps):
+                design[a, t * bumps + j] = (
+                    gap * measured.bumps[k, j] + lever * measured.slopes[k, j]
+                )
+        for b in range(3):
+            design[a, size + b] = -answer.from_start[k, a, b]
+
+
+@njit(_nrt=False)
+@no_type_check
+def _advance(state, variance, k, size):
+    """The state after a transition, from the whitened innovation and the cross covariance.
+
+    The field goes on; the error of this pose takes the place of the error of the last one.
+    """
+    mean, covariance, gain = state.mean, state.covariance, state.cross
+    for a in range(3):
+        mean[size + a] = 0.0
+        for r in range(size + 3):
+            covariance[size + a, r] = covariance[r, size + a] = 0.0
+        for b in range(3):
+            gain[size + a, b] = variance[k + 1, a] if a == b else 0.0
+        covariance[size + a, size + a] = variance[k + 1, a]
+    for r in range(size + 3):
+        for a in range(3):
+            for b in range(a):
+                gain[r, a] -= state.factor[a, b] * gain[r, b]
+            gain[r, a] /= state.factor[a, a]
+            mean[r] += gain[r, a] * state.innovation[a]
+    for r in range(size + 3):
+        for s in range(r + 1):
+            value = covariance[r, s]
+            for a in range(3):
+                value -= gain[r, a] * gain[s, a]
+            covariance[r, s] = covariance[s, r] = value
+
+
+@njit(_nrt=False)
 @no_type_check
 def _factorise(matrix):
     """Cholesky factor in the lower triangle, in place; returns the log determinant."""
     result = 0.0
-    for j in range(matrix.shape[0]):
-        for i in range(j, matrix.shape[0]):
+    for j in range(3):
+        for i in range(j, 3):
             value = matrix[i, j]
             for k in range(j):
                 value -= matrix[i, k] * matrix[j, k]
@@ -172,64 +269,19 @@ def _factorise(matrix):
     return result
 
 
-@njit(cache=True)
+@njit(_nrt=False)
 @no_type_check
 def _forward(factor, vector):
     """Solve L y = vector in place."""
-    for i in range(vector.shape[0]):
+    for i in range(3):
         value = vector[i]
         for k in range(i):
             value -= factor[i, k] * vector[k]
         vector[i] = value / factor[i, i]
 
 
-@njit(cache=True)
-@no_type_check
-def _accumulate(precision, vector, gap, lever, error, values, slopes):
-    """Add H^T S^-1 H and H^T S^-1 r of one transition, from whitened vectors."""
-    terrains, bumps = gap.shape[0], values.shape[0]
-    for t in range(terrains):
-        touched = gap[t, 0] != 0.0 or gap[t, 1] != 0.0 or gap[t, 2] != 0.0
-        if not touched:
-            continue
-        by_gap = by_lever = 0.0
-        for a in range(3):
-            by_gap += gap[t, a] * error[a]
-            by_lever += lever[t, a] * error[a]
-        for j in range(bumps):
-            vector[t * bumps + j] += by_gap * values[j] + by_lever * slopes[j]
-        for u in range(terrains):
-            gg = gl = lg = ll = 0.0
-            for a in range(3):
-                gg += gap[t, a] * gap[u, a]
-                gl += gap[t, a] * lever[u, a]
-                lg += lever[t, a] * gap[u, a]
-                ll += lever[t, a] * lever[u, a]
-            for j in range(bumps):
-                first = gg * values[j] + lg * slopes[j]
-                second = gl * values[j] + ll * slopes[j]
-                for k in range(bumps):
-                    precision[t * bumps + j, u * bumps + k] += (
-                        first * values[k] + second * slopes[k]
-                    )
+explain_range = _compile_explain_range(source_stamp(sys.modules[__name__]))
+"""Evaluate particles `first` up to `last`: (world, law, request, measured, found, first, last).
 
-
-@njit(cache=True)
-@no_type_check
-def _gain(precision, vector, factor, solved, sd):
-    """Log of the field's integral, 1/2 v^T A^-1 v - 1/2 log |sd^2 A|; `solved` becomes A^-1 v."""
-    size = vector.shape[0]
-    if size == 0:
-        return 0.0
-    factor[:], solved[:] = precision, vector
-    log_determinant = _factorise(factor)
-    _forward(factor, solved)
-    square = 0.0
-    for a in range(size):
-        square += solved[a] * solved[a]
-    for i in range(size - 1, -1, -1):
-        value = solved[i]
-        for k in range(i + 1, size):
-            value -= factor[k, i] * solved[k]
-        solved[i] = value / factor[i, i]
-    return 0.5 * square - 0.5 * log_determinant - size * math.log(sd)
+Fills their part of `found` in place and releases the interpreter lock meanwhile.
+"""

@@ -9,6 +9,10 @@ it is integrated out of the likelihood in closed form, learnt from the same data
 posterior corrects and widens predictions (Rao-Blackwellisation).
 
 eps_t(angle) = sum_j b_j(angle) c_tj, with c ~ N(0, sd^2) and Gaussian bumps b_j.
+
+How far the true outline is from the best one of the prior differs by a factor of ten from
+object to object, so sd is itself unknown: log-normal around what the prior missed on outlines
+outside of its training, and learnt as one more entry of every particle.
 """
 
 from __future__ import annotations
@@ -25,10 +29,12 @@ from tpcd.simulator import Transition
 
 @dataclass(frozen=True)
 class MisfitField:
-    """Bumps on a grid of angles, spaced by their width."""
+    """Bumps on a grid of angles, spaced by their width, and the prior of their size."""
 
     sd: float
-    """Standard deviation of the outline error [m]; 0 switches the field off."""
+    """Median of the standard deviation of the outline error [m]; 0 switches the field off."""
+    spread: float = 0.0
+    """Standard deviation of the logarithm of that standard deviation; 0 makes it known."""
     width: float = 0.15
     """Width and spacing of the bumps [rad]: how far the object turns until the error is another."""
     reach: float = 0.45
@@ -36,9 +42,10 @@ class MisfitField:
 
     def __post_init__(self) -> None:
         """Refuse a field without meaning."""
-        if self.sd < 0 or self.width <= 0 or self.reach < 0:
+        if min(self.sd, self.spread, self.reach) < 0 or self.width <= 0:
             raise ValueError(
-                f"misfit sd {self.sd}, reach {self.reach} must be >= 0 and width {self.width} > 0"
+                f"misfit sd {self.sd}, spread {self.spread} and reach {self.reach} must be >= 0 "
+                f"and width {self.width} > 0"
             )
 
     @property
@@ -47,6 +54,10 @@ class MisfitField:
         if self.sd == 0:
             return 0
         return 2 * math.ceil(self.reach / self.width) + 1
+
+    def sd_of(self, score: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Standard deviation of the outline error [m] from a standard normal score."""
+        return self.sd * torch.exp(self.spread * score)
 
     def basis(
         self, angle: Float[Tensor, "*batch"]
@@ -61,7 +72,10 @@ class MisfitField:
 
 
 def misfit_rows(
-    field: MisfitField, angle: Float[Tensor, "*#batch"], transition: Transition
+    field: MisfitField,
+    sd: Float[Tensor, "*#batch"],
+    angle: Float[Tensor, "*#batch"],
+    transition: Transition,
 ) -> tuple[Float[Tensor, "*batch 3 c"], Float[Tensor, "*batch 3 3"]]:
     """How the settled pose answers the field: rows H with pose = model + H c, and the
     covariance of the part of the error that the bumps do not cover. c = t x j coefficients."""
@@ -69,6 +83,6 @@ def misfit_rows(
     gap, lever = transition.pose_from_gap, transition.pose_from_lever
     rows = gap[..., None] * value[..., None, None, :] + lever[..., None] * slope[..., None, None, :]
     rows = rows.transpose(-3, -2).flatten(-2)
-    uncovered = field.sd**2 * (1 - (value**2).sum(-1)).clamp_min(0.0)
+    uncovered = sd**2 * (1 - (value**2).sum(-1)).clamp_min(0.0)
     covariance = (gap.mT @ gap) * uncovered[..., None, None]
     return rows, covariance

@@ -36,7 +36,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.belief import Belief, EstimationStep
-from tpcd.belief.likelihood import column_scene
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.resampling import (
@@ -45,7 +44,7 @@ from tpcd.belief.resampling import (
     systematic_resample,
 )
 from tpcd.belief.smc import CloudInfo
-from tpcd.contact import scene_from_parameters
+from tpcd.contact import column_scene, scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
@@ -217,8 +216,9 @@ def _belief(
         vectors=vectors,
         weights=weights,
         misfit=MisfitField(sd=0.0),
+        misfit_sd=torch.zeros(count, dtype=torch.float64),
         misfit_mean=torch.zeros(count, 0, dtype=torch.float64),
-        misfit_precision=torch.zeros(count, 0, 0, dtype=torch.float64),
+        misfit_covariance=torch.zeros(count, 0, 0, dtype=torch.float64),
         step=settings.step,
         stiffness=episode.stiffness.double(),
         log_evidence=math.nan,

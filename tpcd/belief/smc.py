@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tpcd.belief.likelihood import Threshold
 from tpcd.belief.proposals import StudentMixture, fit_student_mixture
 from tpcd.belief.resampling import (
     effective_sample_size,
@@ -30,8 +31,9 @@ from tpcd.belief.resampling import (
 )
 
 LogDensity = Callable[[Tensor], Tensor]
-LogLikelihood = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Coordinates (m, d) to log likelihood (m) of the history before and with the new datum."""
+LogLikelihood = Callable[[Tensor, Threshold | None], tuple[Tensor, Tensor]]
+"""Coordinates (m, d) to log likelihood (m) of the history before and with the new datum; a
+particle that stays below its threshold may get -inf for both."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +44,14 @@ class SamplerSettings:
     """Particles in the cloud."""
     kept_share: float = 0.5
     """Share of the effective sample size that one temperature step keeps."""
-    components: int = 4
+    components: int = 8
     """Components of the fitted mixture."""
     least_moves: int = 2
     """Fewest moves of every particle after each temperature."""
     most_moves: int = 8
     """Most moves of every particle after each temperature."""
     moved_share: float = 0.98
-    """Moves stop early once this share of the particles has left its place, on the mean of
-    accepted moves."""
+    """Moves stop early once this share of the particles has left its place."""
     final_moves: int = 4
     """Moves at full likelihood once the datum is in."""
     independent_share: float = 0.5
@@ -126,7 +127,7 @@ def assimilate(
 
     Raises ValueError where no particle can explain the datum at all.
     """
-    state = _State(cloud, *log_likelihood(cloud.positions))
+    state = _State(cloud, *log_likelihood(cloud.positions, None))
     tally = _Tally(evaluations=len(cloud.positions))
     temperature, smallest = 0.0, float(len(cloud.positions))
     while temperature < 1.0:
@@ -256,11 +257,11 @@ def _move(
     tally: _Tally,
 ) -> _State:
     """Metropolis-Hastings moves that leave the tempered posterior invariant."""
-    still = torch.ones(len(state.before), dtype=torch.float64)
-    least = settings.final_moves if last else settings.least_moves
+    still = torch.ones(len(state.before), dtype=torch.bool)
+    fewest = settings.final_moves if last else settings.least_moves
     share_independent = settings.independent_share
     for move in range(settings.most_moves):
-        if move >= least and float(still.mean()) <= 1 - settings.moved_share:
+        if move >= fewest and float(still.double().mean()) <= 1 - settings.moved_share:
             break
         # Independent moves come due at their share of all moves so far, the first one first.
         due = math.ceil((move + 1) * share_independent) - math.ceil(move * share_independent)
@@ -274,12 +275,13 @@ def _move(
             proposal = here + state.cloud.step_scale * noise @ spread.T
             correction = torch.zeros_like(state.before)
         prior = log_prior(proposal)
-        before, with_datum = log_likelihood(proposal)
-        new = prior + before + temperature * (with_datum - before)
         old = state.cloud.log_prior + state.before + temperature * (state.with_datum - state.before)
-        ratio = torch.where(torch.isfinite(new), new - old + correction, -torch.inf)
         uniform = torch.rand(len(here), generator=generator, dtype=torch.float64)
-        accepted = uniform.log() < ratio
+        least = uniform.log() + old - correction - prior
+        least = torch.where(torch.isnan(least), torch.inf, least)
+        before, with_datum = log_likelihood(proposal, Threshold(least, temperature))
+        # Below its threshold a proposal may come back as -inf, and -inf - -inf is no number.
+        accepted = before + temperature * (with_datum - before) > least
         share = float(accepted.double().mean())
         scale = state.cloud.step_scale
         if not independent:
@@ -295,7 +297,7 @@ def _move(
             torch.where(accepted, before, state.before),
             torch.where(accepted, with_datum, state.with_datum),
         )
-        still = still * (1 - torch.exp(ratio.clamp(max=0.0)))
+        still = still & ~accepted
         tally.count("independent" if independent else "local", len(here), int(accepted.sum()))
     return state
 

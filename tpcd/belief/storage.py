@@ -25,8 +25,8 @@ from tpcd.shape.checkpoint import find_prior, load_prior
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
-FORMAT_VERSION = 1
-_TENSORS = ("vectors", "weights", "misfit_mean", "misfit_precision", "stiffness")
+FORMAT_VERSION = 2
+_TENSORS = ("vectors", "weights", "misfit_sd", "misfit_mean", "misfit_covariance", "stiffness")
 
 
 def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from tpcd.belief.belief import Belief, EstimationStep
+from tpcd.belief.belief import Belief, EstimationStep, weighted_quantile
 from tpcd.belief.storage import save_belief
 from tpcd.contact import place_points
 from tpcd.data.episode import Episode
@@ -98,7 +98,14 @@ def summarise(belief: Belief) -> dict[str, Any]:
         "parameters": entries,
         "log_evidence": belief.log_evidence,
         "log_evidence_std": belief.log_evidence_std,
-        "outline_misfit_sd": belief.misfit.sd,
+        "outline_misfit_sd": {
+            "mean": float(belief.weights @ belief.misfit_sd),
+            "interval_90": [
+                float(weighted_quantile(belief.misfit_sd, belief.weights, level))
+                for level in (0.05, 0.95)
+            ],
+            "unit": "m",
+        },
         "particles": len(belief.weights),
     }
 

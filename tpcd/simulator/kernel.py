@@ -16,6 +16,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple, no_type_check
 
 import numpy as np
@@ -74,14 +75,15 @@ class Answer(NamedTuple):
     from_lever: np.ndarray
 
 
-def _source_stamp() -> int:
-    """A number for the sources of everything compiled here.
+def source_stamp(*more: ModuleType) -> int:
+    """A number for the sources of everything compiled here, and in more modules.
 
     numba's cache looks only at the file of the function it keeps, so what changes in the
     files it calls must be part of the key, or old code would run.
     """
     digest = hashlib.sha256()
-    for module in (sys.modules[__name__], kernel_geometry, kernel_settle, kernel_slopes, compiled):
+    own = sys.modules[__name__]
+    for module in (own, kernel_geometry, kernel_settle, kernel_slopes, compiled, *more):
         digest.update(Path(str(module.__file__)).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")
 
@@ -112,16 +114,24 @@ def _step_range(world, law, request, answer, first, last):
         o, end = request.owner[b], b + 1
         while end < last and request.owner[end] == o:
             end += 1
-        extent = _extent(world, o)
-        if math.isfinite(extent):
-            low, high = _angles(request, b, end)
-            lean = 0.0 if law.coulomb else _largest(world.friction, o) * (high - low)
-            build_chains(world, o, low, high, 2.0 * PROBE + lean, chains)
+        extent = prepare(world, o, law, request, b, end, chains)
         for element in range(b, end):
-            _step_element(
+            step_element(
                 world, o, chains, law, extent, request, element, answer, space, slopes, poses
             )
         b = end
+
+
+@njit(_nrt=False)
+@no_type_check
+def prepare(world, o, law, request, first, last, chains):
+    """Chains of a scene for some transitions; returns how far its outline reaches [m]."""
+    extent = _extent(world, o)
+    if math.isfinite(extent):
+        low, high = _angles(request, first, last)
+        lean = 0.0 if law.coulomb else _largest(world.friction, o) * (high - low)
+        build_chains(world, o, low, high, 2.0 * PROBE + lean, chains)
+    return extent
 
 
 @njit(_nrt=False)
@@ -175,7 +185,7 @@ def wrap(angle):
 
 @njit(nogil=True, error_model="numpy", _nrt=False)
 @no_type_check
-def _step_element(world, o, chains, law, extent, request, b, answer, space, slopes, poses):
+def step_element(world, o, chains, law, extent, request, b, answer, space, slopes, poses):
     """One transition: rest on what was touched, go to the command, follow its path if need be."""
     start, before, command, part = poses[0], poses[1], poses[2], poses[3]
     landing, pose, kept_pose = poses[4], poses[5], poses[6]
@@ -289,7 +299,7 @@ def _modes(space, modes, b):
                 modes[b, t] = slip if space.slipping[j] else 1
 
 
-step_range = _compile_step_range(_source_stamp())
+step_range = _compile_step_range(source_stamp())
 """Step the transitions `first` up to `last`: (world, law, request, answer, first, last).
 
 Fills their part of the answer in place and releases the interpreter lock meanwhile.

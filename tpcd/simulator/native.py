@@ -12,6 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float, Int
@@ -21,6 +22,11 @@ from tpcd.contact import ContactScene
 from tpcd.planar import wrap_angle
 from tpcd.simulator.record import StepSettings, Transition
 from tpcd.terrain import HalfPlane
+
+if TYPE_CHECKING:
+    from tpcd.simulator.kernel import Request
+    from tpcd.simulator.kernel_geometry import World
+    from tpcd.simulator.kernel_settle import Law
 
 CHUNK = 64
 """Fewest transitions handed to a thread at once."""
@@ -70,17 +76,9 @@ def step(
     settings: StepSettings,
 ) -> Transition:
     """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
-    from tpcd.simulator.kernel import Answer, Request, step_range
-    from tpcd.simulator.kernel_geometry import World
-    from tpcd.simulator.kernel_settle import Law
+    from tpcd.simulator.kernel import Answer, step_range
 
     count, terrains = len(owner), len(scene.terrains)
-    planes = [body for body in scene.terrains if isinstance(body, HalfPlane)]
-    batch = scene.batch_shape
-    points = scene.points_ee.detach().double()
-    points = points.reshape(-1, *points.shape[-2:]).mT.contiguous()
-    normals = torch.stack([p.direction.detach().expand(*batch, 2) for p in planes], -2)
-    offsets = torch.stack([p.offset.detach().expand(batch) for p in planes], -1)
     pose = torch.empty(count, 3, dtype=torch.float64)
     mode = torch.empty(count, terrains, dtype=torch.int64)
     status = torch.empty(count, dtype=torch.int64)
@@ -88,29 +86,8 @@ def step(
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
-    world = World(
-        points.numpy(),
-        _flat(normals, terrains, 2),
-        _flat(offsets, terrains),
-        _flat(scene.friction.detach(), terrains),
-    )
-    law = Law(
-        stiffness.detach().double().numpy(),
-        stiffness.detach().double().sqrt().numpy(),
-        settings.friction == "coulomb",
-        settings.rounds,
-        settings.tolerance,
-        settings.compliance,
-    )
-    request = Request(
-        owner.numpy(),
-        _flat(start.detach(), 3),
-        _flat((start if previous is None else previous).detach(), 3),
-        _flat(command.detach(), 3),
-        previous is None,
-        settings.substeps,
-        settings.follow_path,
-    )
+    world, law = world_of(scene), law_of(stiffness, settings)
+    request = request_of(owner, start, previous, command, settings)
     answer = Answer(
         pose.numpy(),
         mode.numpy(),
@@ -126,6 +103,59 @@ def step(
     wrench = stiffness.double() * (pose - target)
     pose[:, 2] = wrap_angle(pose[:, 2])
     return Transition(pose, wrench, mode, status, residual, from_start, from_gap, from_lever)
+
+
+def world_of(scene: ContactScene) -> World:
+    """The scenes of a flat batch against half-planes, as the compiled loops read them."""
+    from tpcd.simulator.kernel_geometry import World
+
+    terrains, batch = len(scene.terrains), scene.batch_shape
+    planes = [body for body in scene.terrains if isinstance(body, HalfPlane)]
+    points = scene.points_ee.detach().double()
+    points = points.reshape(-1, *points.shape[-2:]).mT.contiguous()
+    normals = torch.stack([p.direction.detach().expand(*batch, 2) for p in planes], -2)
+    offsets = torch.stack([p.offset.detach().expand(batch) for p in planes], -1)
+    return World(
+        points.numpy(),
+        _flat(normals, terrains, 2),
+        _flat(offsets, terrains),
+        _flat(scene.friction.detach(), terrains),
+    )
+
+
+def law_of(stiffness: Float[Tensor, " 3"], settings: StepSettings) -> Law:
+    """Impedance and settings, as the compiled loops read them."""
+    from tpcd.simulator.kernel_settle import Law
+
+    return Law(
+        stiffness.detach().double().numpy(),
+        stiffness.detach().double().sqrt().numpy(),
+        settings.friction == "coulomb",
+        settings.rounds,
+        settings.tolerance,
+        settings.compliance,
+    )
+
+
+def request_of(
+    owner: Int[Tensor, " b"],
+    start: Float[Tensor, "b 3"],
+    previous: Float[Tensor, "b 3"] | None,
+    command: Float[Tensor, "b 3"],
+    settings: StepSettings,
+) -> Request:
+    """Transitions, as the compiled loops read them."""
+    from tpcd.simulator.kernel import Request
+
+    return Request(
+        owner.numpy(),
+        _flat(start.detach(), 3),
+        _flat((start if previous is None else previous).detach(), 3),
+        _flat(command.detach(), 3),
+        previous is None,
+        settings.substeps,
+        settings.follow_path,
+    )
 
 
 def _flat(tensor: Tensor, *shape: int):

@@ -1,0 +1,91 @@
+"""Extended Kalman filter over the transitions, for given theta and batches of particles.
+
+The unknowns that theta leaves are linear and normal: the coefficients c of the misfit field,
+and the error e_k of each estimated pose, poses[k] = true pose + e_k with e_k ~ N(0, R_k). A
+transition starts at the filtered pose s = poses[k - 1] - E[e_{k-1}] and leaves the residual
+
+    r_k = poses[k] - f(s, u_k) = e_k - F_k (e_{k-1} - E[e_{k-1}]) + H_k c + v_k,
+
+with F = d pose / d start, H from `misfit_rows` and v_k ~ N(0, V_k) what the bumps do not
+cover. So one reading's error is in two residuals, and the state (c, e_{k-1}) is carried from
+one transition to the next. In free motion the arm reaches its command, and what was read
+there no longer matters. The innovations give the likelihood of theta term by term, and the
+state the posterior of the field (Kalman 1960; Rao-Blackwellised particle filters).
+
+A transition far outside of what theta and the field allow (an object wedged between floor
+and wall, a bad reading) has its innovation covariance grown until the innovation lies at the
+border: its log likelihood then falls with the logarithm of the distance, as for a Student
+distribution, and it no longer bends the state.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+OUTLIER_SQUARE = 16.3
+"""Squared Mahalanobis distance (3 degrees of freedom, 0.1 %) from which a transition counts
+as not explained: its covariance grows so that it stays at this distance."""
+
+
+@dataclass(frozen=True)
+class FieldState:
+    """Normal belief over s = c + 3 numbers, the misfit coefficients and the error of the last
+    pose, m particles."""
+
+    mean: Float[Tensor, "m s"]
+    covariance: Float[Tensor, "m s s"]
+
+
+def first_state(
+    sd: Float[Tensor, " m"], coefficients: int, variance: Float[Tensor, " 3"]
+) -> FieldState:
+    """Before any transition: coefficients of standard deviation sd, first pose of `variance`."""
+    field = (sd**2)[:, None].expand(-1, coefficients)
+    diagonal = torch.cat((field, variance.expand(len(sd), 3)), dim=-1)
+    return FieldState(torch.zeros_like(diagonal), torch.diag_embed(diagonal))
+
+
+def assimilate(
+    state: FieldState,
+    residual: Float[Tensor, "m 3"],
+    rows: Float[Tensor, "m 3 c"],
+    from_start: Float[Tensor, "m 3 3"],
+    variance: Float[Tensor, " 3"],
+    uncovered: Float[Tensor, "m 3 3"],
+) -> tuple[FieldState, Float[Tensor, " m"]]:
+    """The state after a transition that started at the filtered pose, and the log density of
+    its residual given those before."""
+    count = rows.shape[-1]
+    design = torch.cat((rows, -from_start), dim=-1)
+    cross = state.covariance @ design.mT
+    noise = torch.diag(variance)
+    covariance = design @ cross + noise + uncovered
+    innovation = residual - (rows @ state.mean[:, :count, None])[..., 0]
+    factor, whitened = _whiten(covariance, innovation)
+    square = (whitened**2).sum(-1)
+    growth = (square / OUTLIER_SQUARE).clamp_min(1.0)
+    # Growing the covariance by a number stretches its factor by the root.
+    factor, whitened = factor * growth.sqrt()[:, None, None], whitened / growth.sqrt()[:, None]
+    log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    log_density = -0.5 * square / growth - 0.5 * log_determinant - 1.5 * math.log(2 * math.pi)
+    # The next state: the field goes on, the error of this pose takes the place of the last.
+    answer = torch.cat((cross[:, :count], noise.expand_as(covariance)), dim=1)
+    gain = torch.linalg.solve_triangular(factor, answer.mT, upper=False).mT
+    keep = torch.cat((state.mean[:, :count], torch.zeros_like(innovation)), dim=-1)
+    before = torch.zeros_like(state.covariance)
+    before[:, :count, :count] = state.covariance[:, :count, :count]
+    before[:, count:, count:] = noise
+    mean = keep + (gain @ whitened[..., None])[..., 0]
+    return FieldState(mean, before - gain @ gain.mT), log_density
+
+
+def _whiten(covariance: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
+    """Cholesky factor L of each covariance, and L^-1 vector."""
+    factor = torch.linalg.cholesky(covariance)
+    whitened = torch.linalg.solve_triangular(factor, vector[..., None], upper=False)
+    return factor, whitened[..., 0]

@@ -76,10 +76,13 @@ def calibrate(config: Calibration) -> None:
 
     from tpcd.belief.prior import make_prior
     from tpcd.figures import save_figure
-    from tpcd.results import format_table, write_results
+    from tpcd.results import CONFIG_FILE, continue_run, format_table, open_run, write_results
 
     torch.set_num_threads(1)
-    folder = _open_or_continue(config)
+    if (config.out / CONFIG_FILE).is_file():
+        folder = continue_run(config.out, config, free=("out", "runs"))
+    else:
+        folder = open_run(config.out, COMMAND, config)
     shape = _shape(config)
     lines_path = folder / RUNS_FILE
     done = read_lines(lines_path)
@@ -265,25 +268,6 @@ def _shape(config: Calibration) -> Shape:
     if config.quick:
         return PolygonShape(builtin_outlines()["mug"])
     return load_prior(config.prior)
-
-
-def _open_or_continue(config: Calibration) -> Path:
-    """A fresh run folder, or one that holds runs of the same settings."""
-    import yaml
-
-    from tpcd.errors import RunError
-    from tpcd.results import CONFIG_FILE, open_run, to_plain
-
-    folder = config.out
-    if not (folder / CONFIG_FILE).is_file():
-        return open_run(folder, COMMAND, config)
-    before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
-    now = to_plain(config)
-    free = ("out", "runs")
-    differing = [key for key in now if key not in free and now[key] != before.get(key)]
-    if differing:
-        raise RunError(folder, f"holds runs of another {', '.join(differing)}", "name a new folder")
-    return folder
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ class Unseen:
     particles: int = 1000
     """Particles of the belief."""
     misfit: float | None = None
-    """Standard deviation of the outline error [m]; by default the prior's own figure."""
+    """Median of the outline error's standard deviation [m]; by default the prior's own figure."""
     truth: str = "mujoco"
     """Source of truth: mujoco or quasistatic."""
     quick: bool = False
@@ -95,7 +95,7 @@ def evaluate_unseen(config: Unseen) -> None:
     from tpcd.figures.quality import calibration, error_bars
     from tpcd.figures.sinks import save_figure
     from tpcd.predict import CHANNELS
-    from tpcd.results import format_table, open_run, write_results
+    from tpcd.results import continue_run, format_table, open_run, write_results
     from tpcd.shape.ycb import load_ycb
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
@@ -103,9 +103,10 @@ def evaluate_unseen(config: Unseen) -> None:
     outlines = load_ycb("main")
     names = config.objects or (QUICK if config.quick else (*SEEN, *UNSEEN))
     priors = config.priors[:1] if config.quick else config.priors
-    folder = config.out
-    if not (config.resume and (folder / "versions.json").is_file()):
-        folder = open_run(config.out, "eval.unseen", config, config.overwrite)
+    if config.resume:
+        folder = continue_run(config.out, config, free=("out", "resume", "overwrite"))
+    else:
+        folder = open_run(config.out, "python -m eval.unseen", config, config.overwrite)
     path = folder / "cells.jsonl"
     cells = _finished(path)
     plan = [(n, p, s) for s in config.seeds for n in names for p in priors]

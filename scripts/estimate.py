@@ -18,15 +18,17 @@ class Estimate:
     prior: str
     """Shape prior: a checkpoint folder, or the name of a shipped one such as ycb-rich."""
     out: Path
-    """Folder for the results; must not hold an earlier run."""
+    """Folder for the results; a stopped run in it goes on with --resume."""
     estimator: Literal["default", "paper"] = "default"
     """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
     particles: int = 1000
     """Particles of the belief (the filter `paper` has its own number)."""
     misfit: float | None = None
-    """Standard deviation of the outline error [m]; by default the prior's own figure."""
+    """Median of the outline error's standard deviation [m]; by default the prior's own figure."""
     seed: int = 0
     """Seed of all random numbers."""
+    resume: bool = False
+    """Go on with a run in the folder that was stopped."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
 
@@ -36,9 +38,10 @@ def estimate_episode(config: Estimate) -> None:
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.belief.state import load_state
     from tpcd.commands.estimation import run_estimation, summarise
     from tpcd.data import check_episode, read_episode
-    from tpcd.results import format_table, open_run, write_results
+    from tpcd.results import continue_run, format_table, open_run, write_results
     from tpcd.shape.checkpoint import load_prior
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
@@ -47,18 +50,23 @@ def estimate_episode(config: Estimate) -> None:
     shape = load_prior(config.prior)
     for warning in check_episode(episode):
         print(f"warning: {warning}")
-    folder = open_run(config.out, "scripts/estimate.py", config, config.overwrite)
+    if config.resume:
+        folder = continue_run(config.out, config, free=("resume", "overwrite"))
+    else:
+        folder = open_run(config.out, "scripts/estimate.py", config, config.overwrite)
+    state = load_state(folder, episode)
+    done = 0 if state is None else state.index
     generator = torch.Generator().manual_seed(config.seed)
     if config.estimator == "paper":
         from tpcd.belief.paper import estimate_paper
 
-        steps = estimate_paper(episode, shape, generator)
+        steps = estimate_paper(episode, shape, generator, state=state)
     else:
         settings = EstimatorSettings(
             sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
         )
-        steps = estimate(episode, shape, generator, settings)
-    belief = run_estimation(steps, episode, config.prior, folder)
+        steps = estimate(episode, shape, generator, settings, state)
+    belief = run_estimation(steps, episode, config.prior, folder, done=done)
     table = [
         {
             "parameter": name,

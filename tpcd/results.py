@@ -75,6 +75,29 @@ def open_run(
     return folder
 
 
+def continue_run(
+    path: str | Path, config: Mapping[str, Any] | Any, free: Sequence[str] = ()
+) -> Path:
+    """Return the folder of a run that was stopped, to go on in it.
+
+    Raises `RunError` when the folder holds no run, or one of another configuration; entries
+    named in `free` may differ.
+    """
+    import yaml
+
+    folder = Path(path)
+    if not (folder / CONFIG_FILE).is_file():
+        raise RunError(folder, "holds no run to go on with", "leave out --resume")
+    before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    now = to_plain(config)
+    differing = [key for key in now if key not in free and now[key] != before.get(key)]
+    if differing:
+        raise RunError(
+            folder, f"holds a run with another {', '.join(differing)}", "name a new folder"
+        )
+    return folder
+
+
 def write_results(
     folder: str | Path,
     table: Sequence[Mapping[str, Any]],

@@ -20,7 +20,16 @@ from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import HistoryLikelihood, Threshold, history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
-from tpcd.belief.smc import Cloud, CloudInfo, SamplerSettings, assimilate, start_cloud
+from tpcd.belief.smc import (
+    Cloud,
+    CloudInfo,
+    SamplerSettings,
+    assimilate,
+    cloud_from_tensors,
+    cloud_to_tensors,
+    start_cloud,
+)
+from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
@@ -94,6 +103,8 @@ class EstimationStep:
     belief: Belief
     info: CloudInfo
     seconds: float
+    state: EstimatorState
+    """What the estimator needs to go on from here."""
 
 
 def estimate(
@@ -101,10 +112,12 @@ def estimate(
     shape: Shape,
     generator: torch.Generator,
     settings: EstimatorSettings | None = None,
+    state: EstimatorState | None = None,
 ) -> Iterator[EstimationStep]:
     """Estimate theta from the transitions of an episode, yielding the belief after each one.
 
-    The episode's own priors replace the defaults. Raises ValueError where no particle can
+    The episode's own priors replace the defaults. With the `state` of an earlier step of the
+    same estimation it goes on after that step. Raises ValueError where no particle can
     explain a transition.
     """
     settings = settings or EstimatorSettings()
@@ -112,8 +125,11 @@ def estimate(
     history = history_of(episode)
     misfit = misfit_field(shape, settings)
     model = _Model(prior, misfit, settings.step)
-    cloud = start_cloud(model.sample(settings.sampler.particles, generator), model.log_prior)
-    for k in range(1, len(history) + 1):
+    if state is None:
+        cloud = start_cloud(model.sample(settings.sampler.particles, generator), model.log_prior)
+    else:
+        cloud = cloud_from_tensors(state.restore(generator))
+    for k in range(1 if state is None else state.index + 1, len(history) + 1):
         started = time.perf_counter()
         so_far = history.first(k)
 
@@ -127,7 +143,9 @@ def estimate(
             cloud, model.log_prior, log_likelihood, settings.sampler, generator
         )
         belief = model.belief(cloud, so_far)
-        yield EstimationStep(k, belief, info, time.perf_counter() - started)
+        seconds = time.perf_counter() - started
+        after = EstimatorState(k, cloud_to_tensors(cloud), generator.get_state())
+        yield EstimationStep(k, belief, info, seconds, after)
 
 
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:

@@ -44,6 +44,7 @@ from tpcd.belief.resampling import (
     systematic_resample,
 )
 from tpcd.belief.smc import CloudInfo
+from tpcd.belief.state import EstimatorState
 from tpcd.contact import column_scene, scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
@@ -92,20 +93,26 @@ def estimate_paper(
     shape: Shape,
     generator: torch.Generator,
     settings: PaperSettings | None = None,
+    state: EstimatorState | None = None,
 ) -> Iterator[EstimationStep]:
     """Run the filter over an episode, yielding the belief after each transition.
 
     The episode's own priors replace the defaults; the latent is uniform where the shape
     model calls it valid. Beliefs carry no misfit field and no evidence (NaN). In `info`,
     `temperatures` counts resamplings (0 or 1), and a distinct ancestor is a particle of the
-    step before that has descendants. Raises ValueError where no particle explains the data.
+    step before that has descendants. With the `state` of an earlier step it goes on after
+    that step. Raises ValueError where no particle explains the data.
     """
     settings = settings or PaperSettings()
     prior = make_prior(shape, episode.priors)
     count = settings.particles
-    vectors = _draw_prior(prior, count, generator)
-    log_weights = torch.zeros(count, dtype=torch.float64)
-    for k in range(1, len(episode)):
+    if state is None:
+        vectors = _draw_prior(prior, count, generator)
+        log_weights = torch.zeros(count, dtype=torch.float64)
+    else:
+        kept = state.restore(generator)
+        vectors, log_weights = kept["vectors"], kept["log_weights"]
+    for k in range(1 if state is None else state.index + 1, len(episode)):
         started = time.perf_counter()
         first = max(1, k - settings.memory + 1)
         likelihood = window_log_likelihood(prior, vectors, episode, first, k, settings)
@@ -127,7 +134,10 @@ def estimate_paper(
             evaluations=count,
         )
         belief = _belief(prior, vectors, weights, episode, settings)
-        yield EstimationStep(k, belief, info, time.perf_counter() - started)
+        seconds = time.perf_counter() - started
+        kept = {"vectors": vectors, "log_weights": log_weights}
+        after = EstimatorState(k, kept, generator.get_state())
+        yield EstimationStep(k, belief, info, seconds, after)
 
 
 def window_log_likelihood(

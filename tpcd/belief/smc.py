@@ -116,6 +116,19 @@ def start_cloud(positions: Float[Tensor, "m d"], log_prior: LogDensity) -> Cloud
     )
 
 
+def cloud_to_tensors(cloud: Cloud) -> dict[str, Tensor]:
+    """The fields of a cloud as tensors, to be stored."""
+    return {
+        name: value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
+        for name, value in vars(cloud).items()
+    }
+
+
+def cloud_from_tensors(tensors: dict[str, Tensor]) -> Cloud:
+    """The cloud that `cloud_to_tensors` made tensors of."""
+    return Cloud(**{n: float(v) if v.ndim == 0 else v for n, v in tensors.items()})  # type: ignore[arg-type]
+
+
 def assimilate(
     cloud: Cloud,
     log_prior: LogDensity,

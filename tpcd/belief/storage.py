@@ -7,6 +7,7 @@ nothing under another prior.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from dataclasses import asdict
 from pathlib import Path
@@ -87,8 +88,9 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         prior=ParameterPrior(shape, values.pop("low"), values.pop("high")),
         misfit=MisfitField(**card["misfit"]),
         step=StepSettings(**card["step"]),
-        log_evidence=card["log_evidence"],
-        log_evidence_std=card["log_evidence_std"],
+        # JSON has no NaN: the filter `paper` estimates no evidence.
+        log_evidence=math.nan if card["log_evidence"] is None else card["log_evidence"],
+        log_evidence_std=math.nan if card["log_evidence_std"] is None else card["log_evidence_std"],
         **values,
     )
 

@@ -1,7 +1,8 @@
 """An estimation into a run folder: belief, summary, progress, figures, TensorBoard.
 
-The folder holds `belief.*` (saved after every step), `steps.jsonl` (one line for each step),
-`summary.json`, `figures/*.png` and a TensorBoard run in `tensorboard`.
+The folder holds `belief.*` and `state.safetensors` (saved after every step), `steps.jsonl`
+(one line for each step), `summary.json`, `figures/*.png` and a TensorBoard run in
+`tensorboard`. With the state, a run that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tpcd.belief.belief import Belief, EstimationStep, weighted_quantile
-from tpcd.belief.storage import save_belief
+from tpcd.belief.state import save_state
+from tpcd.belief.storage import load_belief, save_belief
 from tpcd.contact import place_points
 from tpcd.data.episode import Episode
 from tpcd.figures.outline import outline_belief
@@ -29,6 +31,7 @@ from tpcd.results import write_json
 STILL_PRIOR = 0.85
 """A 90 % interval wider than this share of the prior's counts as nothing learnt."""
 OUTLINES_DRAWN = 200
+STEPS_FILE = "steps.jsonl"
 
 
 @dataclass(frozen=True)
@@ -46,17 +49,21 @@ def run_estimation(
     folder: Path,
     truth: KnownTruth | None = None,
     show_progress: bool = True,
+    done: int = 0,
 ) -> Belief:
-    """Draw the steps of an estimator to their end, saving as it goes; returns the belief."""
+    """Draw the steps of an estimator to their end, saving as it goes; returns the belief.
+
+    `done` steps of an earlier run in the folder are kept, and `steps` come after them.
+    """
     from torch.utils.tensorboard import SummaryWriter
 
     figures = folder / "figures"
-    history: list[dict[str, Any]] = []
-    belief: Belief | None = None
+    history = _earlier_rows(folder / STEPS_FILE, done)
+    belief = load_belief(folder) if done else None
     with (
-        SummaryWriter(folder / "tensorboard") as writer,
-        (folder / "steps.jsonl").open("w", encoding="utf-8") as lines,
-        tqdm(total=len(episode) - 1, unit="step", disable=not show_progress) as bar,
+        SummaryWriter(folder / "tensorboard", purge_step=done + 1) as writer,
+        (folder / STEPS_FILE).open("a", encoding="utf-8") as lines,
+        tqdm(total=len(episode) - 1, initial=done, unit="step", disable=not show_progress) as bar,
     ):
         for step in steps:
             learnt = _learnt_most(belief, step.belief)
@@ -66,6 +73,7 @@ def run_estimation(
             lines.write(json.dumps(row) + "\n")
             lines.flush()
             save_belief(belief, folder, prior_name)
+            save_state(step.state, folder, episode)
             _log_scalars(writer, row, step)
             bar.set_postfix_str(
                 f"n_eff {row['effective_sample_size']:.0f}, learnt {learnt}, "
@@ -77,6 +85,14 @@ def run_estimation(
         write_json(folder / "summary.json", summarise(belief))
         _draw(belief, history, episode, figures, writer, truth)
     return belief
+
+
+def _earlier_rows(path: Path, done: int) -> list[dict[str, Any]]:
+    """The first rows of the file; later ones, of a step that was not finished, are dropped."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = path.read_text(encoding="utf-8").splitlines()[:done] if done else []
+    path.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    return [json.loads(line) for line in lines]
 
 
 def summarise(belief: Belief) -> dict[str, Any]:

@@ -1,0 +1,84 @@
+"""What an estimator needs to go on after a step: tensors by name, kept beside the belief.
+
+Everything is stored exactly, the random generator included, so that a run that was stopped
+and goes on gives the same numbers as one that was not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from tpcd.data.episode import Episode
+from tpcd.errors import RunError
+
+STATE_FILE = "state.safetensors"
+
+
+@dataclass(frozen=True)
+class EstimatorState:
+    """The estimator after `index` transitions: named tensors, and the generator's state."""
+
+    index: int
+    tensors: Mapping[str, Tensor]
+    generator: Tensor
+
+    def restore(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Set the generator back and return the tensors."""
+        generator.set_state(self.generator)
+        return dict(self.tensors)
+
+
+def save_state(state: EstimatorState, folder: Path, episode: Episode) -> None:
+    """Write the state in one move, with a fingerprint of the episode it belongs to."""
+    target = folder / STATE_FILE
+    content = {name: value.contiguous() for name, value in state.tensors.items()}
+    content["generator"] = state.generator
+    card = {"index": str(state.index), "episode": fingerprint(episode)}
+    staged = target.with_suffix(".staged")
+    staged.write_bytes(save_tensors(content, card))
+    os.replace(staged, target)
+
+
+def load_state(folder: Path, episode: Episode) -> EstimatorState | None:
+    """Read the state back; None where no step was finished.
+
+    Raises `RunError` where it belongs to other data or cannot be read.
+    """
+    path = folder / STATE_FILE
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, framework="pt") as file:
+            card = file.metadata()
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        index, of = int(card["index"]), card["episode"]
+        generator = tensors.pop("generator")
+    except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
+        raise RunError(path, f"cannot be read ({error})", "estimate again") from error
+    if of != fingerprint(episode):
+        raise RunError(path, "belongs to an episode with other numbers", "estimate again")
+    return EstimatorState(index, tensors, generator)
+
+
+def fingerprint(episode: Episode) -> str:
+    """SHA-256 of the numbers an estimator reads."""
+    digest = hashlib.sha256()
+    for value in (
+        episode.commands,
+        episode.poses,
+        episode.wrenches,
+        episode.stiffness,
+        episode.sensor_std,
+    ):
+        digest.update(value.double().contiguous().numpy().tobytes())
+    digest.update(repr(sorted((episode.priors or {}).items())).encode())
+    return digest.hexdigest()

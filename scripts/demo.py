@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,28 @@ class Demo:
     seed: int = 0
     """Seed of scene, motion, noise and sampler."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, least={"steps": 1, "tests": 1, "test_steps": 1})
+
 
 def demonstrate(config: Demo) -> None:
     """Explore an unknown object in simulation, learn its contacts, and test the predictions."""
+    print("loading ...", flush=True)
+    import torch
+
+    from tpcd.results import run_folder
+
+    # Small tensor operations are fastest on one thread; the compiled loops have their own.
+    torch.set_num_threads(1)
+    with run_folder(config.out, "scripts/demo.py", config, overwrite=True) as folder:
+        explore_and_test(config, folder)
+
+
+def explore_and_test(config: Demo, folder: Path) -> None:
+    """The demonstration in an opened run folder."""
     import importlib.util
     import time
 
-    print("loading ...", flush=True)
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
@@ -50,20 +65,17 @@ def demonstrate(config: Demo) -> None:
     from tpcd.figures.quality import calibration
     from tpcd.figures.sinks import save_figure
     from tpcd.predict import CHANNELS, ContactPredictor
-    from tpcd.results import format_table, open_run, write_results
+    from tpcd.results import format_table, write_results
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record, write_recording
     from tpcd.truth.scene import draw_scene, make_truth
 
-    # Small tensor operations are fastest on one thread; the compiled loops have their own.
-    torch.set_num_threads(1)
     outlines = builtin_outlines()
     if config.outline not in outlines:
         raise ValueError(
             f"outline is {config.outline!r}, expected one of {', '.join(sorted(outlines))}"
         )
-    folder = open_run(config.out, "scripts/demo.py", config, overwrite=True)
     kind = "mujoco" if importlib.util.find_spec("mujoco") else "quasistatic"
     generator = torch.Generator().manual_seed(config.seed)
     scene = draw_scene(config.outline, outlines[config.outline].vertices, generator)

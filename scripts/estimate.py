@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 
 @dataclass(frozen=True)
@@ -32,55 +32,71 @@ class Estimate:
     overwrite: bool = False
     """Replace an earlier run in the folder."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, least={"particles": 16}, above={"misfit": 0.0})
+
 
 def estimate_episode(config: Estimate) -> None:
     """Estimate the contact model from an episode and write the belief to a run folder."""
+    import sys
+    from contextlib import nullcontext
+
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
-    from tpcd.belief.state import load_state
+    from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation, summarise
+    from tpcd.commands.plausibility import check_start_pose
     from tpcd.data import check_episode, read_episode
-    from tpcd.results import continue_run, format_table, open_run, write_results
+    from tpcd.results import continue_run, format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
     episode = read_episode(config.episode)
     shape = load_prior(config.prior)
+    check_start_pose(episode, shape)
     for warning in check_episode(episode):
-        print(f"warning: {warning}")
+        print(f"warning: {warning}", file=sys.stderr)
     if config.resume:
-        folder = continue_run(config.out, config, free=("resume", "overwrite"))
+        # The state knows its data, so files may have been moved.
+        free = ("episode", "out", "resume", "overwrite")
+        opened = nullcontext(continue_run(config.out, config, free))
     else:
-        folder = open_run(config.out, "scripts/estimate.py", config, config.overwrite)
-    state = load_state(folder, episode)
-    done = 0 if state is None else state.index
-    generator = torch.Generator().manual_seed(config.seed)
-    if config.estimator == "paper":
-        from tpcd.belief.paper import estimate_paper
-
-        steps = estimate_paper(episode, shape, generator, state=state)
-    else:
-        settings = EstimatorSettings(
-            sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
+        opened = run_folder(
+            config.out, "scripts/estimate.py", config, config.overwrite, resumable=STATE_FILE
         )
-        steps = estimate(episode, shape, generator, settings, state)
-    belief = run_estimation(steps, episode, config.prior, folder, done=done)
-    table = [
-        {
-            "parameter": name,
-            "mean": entry["mean"],
-            "low 5 %": entry["interval_90"][0],
-            "high 95 %": entry["interval_90"][1],
-            "unit": entry["unit"],
-            "": "still the prior" if entry["still_the_prior"] else "",
-        }
-        for name, entry in summarise(belief)["parameters"].items()
-    ]
-    print(format_table(table))
-    write_results(folder, table, seeds=[config.seed])
-    print(f"\nresults in {folder}; next: python scripts/predict.py {folder} EPISODE --out FILE.csv")
+    with opened as folder:
+        state = load_state(folder, episode)
+        done = 0 if state is None else state.index
+        generator = torch.Generator().manual_seed(config.seed)
+        if config.estimator == "paper":
+            from tpcd.belief.paper import estimate_paper
+
+            steps = estimate_paper(episode, shape, generator, state=state)
+        else:
+            settings = EstimatorSettings(
+                sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
+            )
+            steps = estimate(episode, shape, generator, settings, state)
+        belief = run_estimation(steps, episode, config.prior, folder, done=done)
+        table = [
+            {
+                "parameter": name,
+                "mean": entry["mean"],
+                "low 5 %": entry["interval_90"][0],
+                "high 95 %": entry["interval_90"][1],
+                "unit": entry["unit"],
+                "learnt": "still the prior" if entry["still_the_prior"] else "yes",
+            }
+            for name, entry in summarise(belief)["parameters"].items()
+        ]
+        print(format_table(table))
+        write_results(folder, table, seeds=[config.seed])
+    print(
+        f"\nresults in {config.out}; next: python scripts/predict.py {config.out} EPISODE"
+        " --out FILE.csv"
+    )
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,9 @@ class Predict:
     overwrite: bool = False
     """Replace an existing file."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, least={"particles": 1})
+
 
 def predict_episodes(config: Predict) -> None:
     """Predict every row of the episodes from the row before and print error and coverage."""
@@ -47,12 +50,11 @@ def predict_episodes(config: Predict) -> None:
     from tpcd.data import read_episode
     from tpcd.errors import RunError
     from tpcd.predict import ContactPredictor
-    from tpcd.results import format_table
+    from tpcd.results import check_target, format_table
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
-    if config.out.exists() and not config.overwrite:
-        raise RunError(config.out, "exists already", "choose another name or pass --overwrite")
+    check_target(config.out, config.overwrite)
     episodes = [read_episode(path) for path in config.episodes]
     belief = load_belief(config.run)
     for path, episode in zip(config.episodes, episodes, strict=True):

@@ -6,11 +6,12 @@ python scripts/simulate.py --outline 006_mustard_bottle --policy test --episodes
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
     import torch
@@ -22,6 +23,14 @@ SCENE_STREAM, EPISODE_STREAM = 0, 1
 
 TOUCHING = 2e-4
 """Clearance under which the summary counts a step as touching [m]."""
+
+METRES = ("mount_x", "mount_z", "floor_height", "wall_position", "noise_position")
+METRES += ("start x", "start z")
+RADIANS = ("mount_phi", "noise_angle", "start phi")
+LARGEST_LENGTH = 5.0
+"""Lengths beyond this [m] are taken for millimetres, as in episodes."""
+FILE_ENDINGS = (".csv", ".parquet", ".yaml", ".truth.csv", ".truth.yaml")
+"""Of the files that an episode here can have."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +79,28 @@ class Simulation:
     """World x of the wall instead of a random one [m]."""
     start: tuple[float, ...] = ()
     """Start pose x z phi instead of one 10 to 20 mm above the floor [m, m, rad]."""
+    unit: Literal["m", "cm", "mm", "in", "px"] | None = None
+    """Unit of the outline file's coordinates instead of metres, or of what an SVG says."""
     format: Literal["csv", "parquet"] = "csv"
     """Format of the episode's table."""
     overwrite: bool = False
     """Replace episodes of the same name."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
+        noise = ("noise_position", "noise_angle", "noise_force", "noise_torque")
+        check_numbers(
+            self,
+            least={"steps": 1, "episodes": 1, "friction": 0.0, **dict.fromkeys(noise, 0.0)},
+            above={"stiffness": 0.0, "scale": 0.0},
+        )
+        start = dict(zip(("start x", "start z", "start phi"), self.start, strict=False))
+        for name, value in {**vars(self), **start}.items():
+            if name in METRES and value is not None and abs(value) > LARGEST_LENGTH:
+                raise ValueError(f"{name} is {value:g}, expected m; it looks like millimetres")
+            if name in RADIANS and value is not None and abs(value) > 2 * math.pi:
+                raise ValueError(f"{name} is {value:g}, expected rad; it looks like degrees")
+        if self.name is not None and (not self.name or Path(self.name).name != self.name):
+            raise ValueError(f"name is {self.name!r}, expected a file name without a folder")
 
 
 def simulate(config: Simulation) -> None:
@@ -88,12 +110,16 @@ def simulate(config: Simulation) -> None:
 
     from tpcd.data.episode import write_together
     from tpcd.parameters import SCENE_NAMES
-    from tpcd.results import to_plain, versions
+    from tpcd.results import check_target, to_plain, versions
     from tpcd.truth.recording import make_motion, record, recording_contents
     from tpcd.truth.scene import draw_scene, make_truth
 
     torch.set_num_threads(1)
-    outline = find_outline(config.outline)
+    name = config.name or config.policy
+    names = [name] if config.episodes == 1 else [f"{name}_{i}" for i in range(config.episodes)]
+    for file in [f"{stem}{ending}" for stem in names for ending in FILE_ENDINGS]:
+        check_target(config.out / file, config.overwrite)
+    outline = find_outline(config.outline, config.unit)
     given = {name: getattr(config, name) for name in SCENE_NAMES}
     scene = draw_scene(
         outline.name,
@@ -111,12 +137,10 @@ def simulate(config: Simulation) -> None:
         [position, position, angle, force, force, torque], dtype=torch.float64
     )
     truth = make_truth(scene, config.truth)
-    name = config.name or config.policy
     notes = f"simulated, truth {config.truth}, motion {config.policy}, seed {config.seed}"
     made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
     contents, lines = {}, []
-    for episode in range(config.episodes):
-        stem = config.out / (name if config.episodes == 1 else f"{name}_{episode}")
+    for episode, stem in enumerate(config.out / name for name in names):
         generator = _generator(
             config.seed, EPISODE_STREAM, episode, *np.frombuffer(config.policy.encode(), np.uint8)
         )
@@ -134,8 +158,8 @@ def simulate(config: Simulation) -> None:
     print("\n".join(lines))
 
 
-def find_outline(name: str) -> Outline:
-    """The outline of a file or of a built-in or YCB name; `ValueError` if there is none."""
+def find_outline(name: str, unit: str | None = None) -> Outline:
+    """The outline of a file (in `unit`) or of a name; `ValueError` if there is none."""
     import difflib
 
     from tpcd.shape.builtin import builtin_outlines
@@ -143,7 +167,7 @@ def find_outline(name: str) -> Outline:
     from tpcd.shape.ycb import load_ycb, ycb_folder
 
     if Path(name).suffix:
-        outlines = load_outlines(name)
+        outlines = load_outlines(name, unit=unit)
         if len(outlines) != 1:
             raise ValueError(
                 f"{name} holds {len(outlines)} outlines ({', '.join(list(outlines)[:6])}, …),"

@@ -9,7 +9,7 @@ from typing import Literal
 import pytest
 import yaml
 
-from tpcd.cli import parse, run
+from tpcd.cli import check_numbers, parse, run
 from tpcd.errors import RunError
 from tpcd.results import to_plain
 
@@ -115,6 +115,11 @@ def test_the_command_line_overrides_the_file(tmp_path: Path, line: str) -> None:
     ("arguments", "named"),
     [
         ((), "RUN and EPISODES missing"),
+        (("here", "one.csv", "--memory.steps", "1.5"), "steps: found '1.5', expected a whole"),
+        (("here", "one.csv", "--friction", "rough"), "'rough', expected one of 'anitescu', 'c"),
+        (("here", "one.csv", "--seeds", "1", "x"), "seeds: found 'x', expected a whole number"),
+        (("here", "one.csv", "--roll-out"), "unknown option --roll_out; did you mean --rollout?"),
+        (("here", "one.csv", "--config"), "--config: the file is missing"),
         (("here",), "EPISODES missing"),
         (("here", "one.csv", "--friction", "none"), "friction"),
         (("here", "one.csv", "--unknown", "1"), "--unknown"),
@@ -134,6 +139,57 @@ def test_a_wrong_argument_is_one_line_and_exit_code_2(
     assert line.count("\n") == 1 and line.endswith("\n")
 
 
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "holds nothing, expected settings by name"),
+        (b"a line of text", "holds a str, expected settings by name"),
+        (b"step,u_x\n0,1\n", "holds a str"),
+        (b"seeds: [", "not valid YAML at line 1"),
+        (b"\xff\xfe", "not a UTF-8 text file"),
+        (b"sedes: [1]", "unknown setting 'sedes' in the configuration; did you mean seeds?"),
+    ],
+)
+def test_a_wrong_configuration_file_is_one_line(
+    tmp_path: Path, content: bytes, problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_bytes(content)
+    assert exit_of(failing(AssertionError()), "here", "one.csv", "--config", str(file)) == 2
+    line = capsys.readouterr().err
+    assert problem in line and line.count("\n") == 1 and len(line) < 300
+
+
+@dataclass(frozen=True)
+class Limited:
+    """Numbers with limits."""
+
+    count: int = 3
+    misfit: float | None = None
+    stiffness: tuple[float, ...] = (1.0, 2.0)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, least={"count": 1}, above={"misfit": 0.0, "stiffness": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "line"),
+    [
+        ({"count": 0}, "count is 0, expected at least 1"),
+        ({"misfit": 0.0}, "misfit is 0, expected more than 0"),
+        ({"misfit": float("nan")}, "misfit is nan, expected a finite number"),
+        ({"stiffness": (1.0, -2.0)}, "stiffness is -2, expected more than 0"),
+        ({"seed": -1}, "seed is -1, expected 0 to"),
+        ({"seed": 2**63}, "seed is 9223372036854775808, expected 0 to"),
+    ],
+)
+def test_numbers_out_of_their_limits_are_named(wrong: dict, line: str) -> None:
+    Limited()
+    with pytest.raises(ValueError, match=line):
+        Limited(**wrong)
+
+
 def failing(error: BaseException):
     def main(config: Settings) -> None:
         """Fail."""
@@ -148,6 +204,7 @@ def failing(error: BaseException):
         (RunError("there", "is not empty", "name a new\nfolder"), 2, "there: is not empty; name a"),
         (ValueError("friction is -1, expected >= 0"), 2, "friction is -1"),
         (FileNotFoundError(2, "No such file or directory", "gone.csv"), 2, "gone.csv"),
+        (PermissionError(13, "Permission denied", "/x"), 2, "/x: Permission denied; choose a"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )

@@ -1,75 +1,24 @@
-"""The commands from end to end, as a user runs them, and what they say about bad input."""
+"""The commands from end to end, as a user runs them."""
 
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import shutil
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
+from command_calls import PRIOR, call, make_world
 
 from tpcd.belief.storage import load_belief
 from tpcd.data import read_episode
-
-ROOT = Path(__file__).resolve().parents[1]
-PRIOR = str(ROOT / "checkpoints" / "ycb21-z2")
-
-
-def load_script(name: str) -> ModuleType:
-    """A script as a module, without running it."""
-    specification = importlib.util.spec_from_file_location(
-        f"script_{name}", ROOT / "scripts" / f"{name}.py"
-    )
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[module.__name__] = module
-    specification.loader.exec_module(module)
-    return module
-
-
-def call(script: str, *arguments: str) -> int:
-    """Run a script in this process and return its exit code."""
-    from tpcd.cli import run
-
-    module = load_script(script)
-    entry = {
-        "simulate": ("simulate", "Simulate", ()),
-        "estimate": ("estimate_episode", "Estimate", ("episode",)),
-        "predict": ("predict_episodes", "Predict", ("run", "episodes")),
-    }[script]
-    main, config = (getattr(module, name) for name in entry[:2])
-    with pytest.raises(SystemExit) as stopped:
-        run(main, config, list(arguments), positional=entry[2], prog=script)
-    return int(stopped.value.code or 0)
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an exploration, a test episode, and the run that learnt from the first."""
-    from tpcd.shape.builtin import builtin_outlines
-    from tpcd.truth.recording import make_motion, record, write_recording
-    from tpcd.truth.scene import draw_scene, make_truth
-
-    folder = tmp_path_factory.mktemp("world")
-    generator = torch.Generator().manual_seed(11)
-    outline = builtin_outlines()["jam_jar"]
-    scene = draw_scene("jam_jar", outline.vertices, generator)
-    truth = make_truth(scene, "quasistatic")
-    for name, policy, steps in (("explore", "rich", 6), ("test", "test", 8)):
-        motion = make_motion(policy, scene, steps, generator)
-        write_recording(record(truth, scene, motion, steps, generator), scene, folder / name)
-    code = call(
-        "estimate",
-        str(folder / "explore.csv"),
-        *("--prior", PRIOR, "--out", str(folder / "run"), "--particles", "100"),
-    )
-    assert code == 0
-    return folder
+    return make_world(tmp_path_factory.mktemp("world"))
 
 
 def test_an_estimate_leaves_a_complete_run(world: Path) -> None:
@@ -139,41 +88,6 @@ def test_nothing_is_overwritten_silently(
     existing.write_text("mine")
     code = call("predict", str(world / "run"), str(world / "test.csv"), "--out", str(existing))
     assert code == 2 and existing.read_text() == "mine"
-
-
-BAD = {
-    "a missing episode": (lambda f: f / "nowhere.csv", PRIOR, "nowhere"),
-    "an unknown prior": (lambda f: f / "explore.csv", "no-such-prior", "no-such-prior"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_gets_one_line_and_leaves_nothing(
-    world: Path, tmp_path: Path, case: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    episode, prior, expected = BAD[case]
-    out = tmp_path / "run"
-    code = call("estimate", str(episode(world)), "--prior", prior, "--out", str(out))
-    error = capsys.readouterr().err.strip()
-    assert code == 2
-    assert expected in error and len(error.splitlines()) == 1
-    assert not out.exists()
-
-
-def test_a_nan_in_an_episode_names_row_and_column(
-    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for suffix in ("csv", "yaml"):
-        shutil.copy(world / f"explore.{suffix}", tmp_path / f"broken.{suffix}")
-    path = tmp_path / "broken.csv"
-    lines = path.read_text().splitlines()
-    cells = lines[3].split(",")
-    cells[4] = "nan"
-    path.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]) + "\n")
-    code = call("estimate", str(path), "--prior", PRIOR, "--out", str(tmp_path / "run"))
-    error = capsys.readouterr().err.strip()
-    assert code == 2 and len(error.splitlines()) == 1
-    assert "broken.csv" in error and "row 2" in error and lines[0].split(",")[4] in error
 
 
 def test_a_belief_of_another_controller_is_refused(

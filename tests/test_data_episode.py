@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tpcd.data import Episode, check_episode, read_episode, write_episode
+from tpcd.data.checks import LARGEST_WRENCH
 from tpcd.data.episode import write_together
 from tpcd.errors import EpisodeError
 
@@ -25,8 +26,9 @@ ROWS = [
 ]
 YAML = "stiffness: [100, 100, 50]\nsensor_std: [2e-4, 0.0002, 0.0005, 0.3, 0.3, 0.02]\n"
 
-number = st.floats(-0.2, 0.2, allow_subnormal=True)
-force = st.floats(allow_nan=False, allow_infinity=False)
+number = st.floats(-0.17, 0.17, allow_subnormal=True)
+force = st.floats(-LARGEST_WRENCH, LARGEST_WRENCH)
+anything = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(1e-6, 1e6)
 text = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=12)
 
@@ -38,8 +40,9 @@ def episodes(draw) -> Episode:
     commands, poses = (torch.tensor(draw(rows), dtype=torch.float64) for _ in range(2))
     poses[0] = commands[0]
     wrenches = draw(st.lists(st.tuples(force, force, force), min_size=n, max_size=n))
+    wrenches[0] = (0.0, 1e-4, -1e-4)
     extra = {
-        "speed": draw(st.lists(force, min_size=n, max_size=n)),
+        "speed": draw(st.lists(anything, min_size=n, max_size=n)),
         "count": draw(st.lists(st.integers(-(10**9), 10**9), min_size=n, max_size=n)),
         "label": draw(st.lists(text.map(lambda s: "t" + s), min_size=n, max_size=n)),
     }
@@ -146,6 +149,9 @@ BAD_TABLES = {
     "jump": (edit(2, "u_x", "0.8"), ["row 2 (line 4)", "u_x", "jumps by 0.8 m", "0.5 m"]),
     "millimetres": (edit(1, "x", "12.5"), ["row 1", "column x", "12.5", "millimetres"]),
     "degrees": (edit(1, "u_phi", "-45"), ["row 1", "column u_phi", "-45", "degrees"]),
+    "pose jumps": (edit(2, "x", "0.8"), ["row 2 (line 4)", "x, z", "the pose jumps by 0.8 m"]),
+    "millinewtons": (edit(2, "F_z", "12000"), ["row 2", "F_z", "12000", "millinewtons"]),
+    "start in contact": (edit(0, "F_z", "2.5"), ["row 0 (line 2), column F_z", "2.5", "zero"]),
     "start command": (edit(0, "u_z", "0.052"), ["row 0", "u_z", "0.052", "start pose z = 0.05"]),
 }  # fmt: skip
 
@@ -164,6 +170,7 @@ BAD_HEADERS = {
     "empty": ("", ["empty file"]),
     "not a mapping": ("- 1\n- 2\n", ["found list"]),
     "broken": ("stiffness: [1, 2\nfoo: : 3\n", ["not valid YAML", "line 2"]),
+    "key twice": (YAML + "stiffness: [1, 1, 1]\n", ["key stiffness appears twice"]),
     "unknown key": (YAML + "sensor_stds: [1]\n", ["unknown key 'sensor_stds'", "'sensor_std'?"]),
     "no stiffness": (YAML.split("\n")[1], ["stiffness is missing", "[100, 100, 50]"]),
     "no noise": (YAML.split("\n")[0], ["sensor_std is missing", "hold the arm still"]),
@@ -193,6 +200,14 @@ def test_a_bad_yaml_gets_one_line_that_names_the_key(case, tmp_path):
     assert_one_helpful_line(caught.value, path.with_suffix(".yaml"), fragments)
 
 
+def test_a_yaml_that_is_no_text_is_called_so(tmp_path):
+    path = write_files(tmp_path)
+    path.with_suffix(".yaml").write_bytes(b"notes: St\xf6\xdfe\n" + YAML.encode())
+    with pytest.raises(EpisodeError) as caught:
+        read_episode(path)
+    assert_one_helpful_line(caught.value, path.with_suffix(".yaml"), ["not a UTF-8 text file"])
+
+
 def assert_one_helpful_line(error: EpisodeError, path: Path, fragments: list[str]) -> None:
     message = str(error)
     assert "\n" not in message
@@ -203,8 +218,11 @@ def assert_one_helpful_line(error: EpisodeError, path: Path, fragments: list[str
 
 
 def test_a_missing_file_a_crowded_folder_and_a_corrupt_parquet_are_named(tmp_path):
-    with pytest.raises(EpisodeError, match="no such file"):
+    with pytest.raises(EpisodeError, match=r"none\.csv: no such file"):
         read_episode(tmp_path / "none.csv")
+    (tmp_path / "table.txt").write_text(HEADER)
+    with pytest.raises(EpisodeError, match=r"table\.txt: is no \.csv or \.parquet table"):
+        read_episode(tmp_path / "table.txt")
     with pytest.raises(EpisodeError, match="found 0 episodes"):
         read_episode(tmp_path)
     path = write_files(tmp_path)

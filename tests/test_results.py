@@ -13,7 +13,15 @@ import torch
 import yaml
 
 from tpcd.errors import FileError, RunError
-from tpcd.results import format_table, open_run, read_json, write_json, write_results
+from tpcd.results import (
+    check_target,
+    format_table,
+    open_run,
+    read_json,
+    run_folder,
+    write_json,
+    write_results,
+)
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,45 @@ def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
     path.write_text("")
     with pytest.raises(RunError, match="is a file"):
         open_run(path, "x", {}, overwrite=True)
+
+
+@pytest.mark.parametrize("reason", [ValueError, KeyboardInterrupt])
+def test_a_run_that_does_not_end_leaves_what_was_there_before(tmp_path: Path, reason) -> None:
+    new, earlier = tmp_path / "deep" / "run", tmp_path / "earlier"
+    (open_run(earlier, "x", {}) / "belief").write_text("kept")
+    for folder, overwrite in ((new, False), (earlier, True)):
+        with pytest.raises(reason), run_folder(folder, "x", {}, overwrite) as inside:
+            (inside / "half").write_text("")
+            raise reason
+    assert [path.name for path in tmp_path.iterdir()] == ["earlier"]
+    names = {"belief", "config.yaml", "versions.json"}
+    assert {path.name for path in earlier.iterdir()} == names
+
+
+def test_a_run_that_ends_replaces_the_earlier_one(tmp_path: Path) -> None:
+    (open_run(tmp_path / "run", "x", {}) / "old").write_text("")
+    with run_folder(tmp_path / "run", "x", {}, overwrite=True) as folder:
+        write_results(folder, [{"a": 1}])
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    names = {"config.yaml", "versions.json", "results.json"}
+    assert {path.name for path in folder.iterdir()} == names
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    for path, problem in (
+        (tmp_path / "file", "exists already; choose another name or pass --overwrite"),
+        (tmp_path / "folder", "is a folder"),
+        (tmp_path / "file" / "below.csv", "is a file; name another folder"),
+    ):
+        with pytest.raises(RunError, match=problem):
+            check_target(path)
+    check_target(tmp_path / "file", overwrite=True)
+    check_target(tmp_path / "new" / "deep.csv")
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(RunError, match="is a file"), run_folder(tmp_path / "file" / "x", "x", {}):
+        pass
 
 
 def test_results_hold_table_configuration_versions_and_seeds(tmp_path: Path) -> None:

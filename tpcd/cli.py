@@ -26,15 +26,17 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 import sys
 import traceback
 import typing
 from argparse import SUPPRESS
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from tpcd import __version__
+from tpcd.cli_messages import check_config_files, parsing_problem, system_problem
 from tpcd.errors import TpcdError
 
 if typing.TYPE_CHECKING:
@@ -44,6 +46,8 @@ Config = TypeVar("Config")
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+LARGEST_SEED = 2**63 - 1
+"""Seeds beyond this do not fit into every generator of random numbers."""
 
 
 def run(
@@ -76,13 +80,16 @@ def run(
             description=description or inspect.getdoc(main),
         )
         code = main(settings) or 0
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"{prog}: interrupted" + (f"; {stop}" if str(stop) else ""), file=sys.stderr)
         code = EXIT_INTERRUPTED
     except (TpcdError, ValueError, OSError) as error:
         if debug:
             traceback.print_exc()
-        line = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, OSError):
+            line = system_problem(error)
+        else:
+            line = " ".join(str(error).split()) or type(error).__name__
         print(f"{prog}: error: {line}", file=sys.stderr)
         code = error.exit_code if isinstance(error, TpcdError) else EXIT_BAD_INPUT
     sys.exit(code)
@@ -104,11 +111,15 @@ def parse(
     from jsonargparse import ArgumentError
 
     parser = _parser(config, positional, prog, description)
+    words, files = _config_first([_underscored(word) for word in argv])
+    check_config_files(files)
+    names = [field.name for field in dataclasses.fields(typing.cast(Any, config))]
     try:
-        values = parser.parse_args(_config_first([_underscored(word) for word in argv]))
+        values = parser.parse_args(words)
         values = parser.instantiate(values)
     except ArgumentError as error:
-        raise ValueError(f"{error}; see {prog} --help") from error
+        problem = parsing_problem(str(error), [*names, "config", "debug"])
+        raise ValueError(f"{problem}; see {prog} --help") from error
     settings, types = {}, typing.get_type_hints(config)
     for field in dataclasses.fields(typing.cast(Any, config)):
         if field.name in values:
@@ -122,6 +133,31 @@ def parse(
     return config(**settings)
 
 
+def check_numbers(
+    config: object,
+    least: Mapping[str, int | float] | None = None,
+    above: Mapping[str, int | float] | None = None,
+) -> None:
+    """Refuse fields of a configuration that are too small, not finite, or no usable seed.
+
+    For `__post_init__`: `least` and `above` map names of fields to limits, inclusive and
+    exclusive; every other number must be finite. A tuple is checked value by value, None
+    passes. Raises `ValueError` that names the field, what was found and what is expected.
+    """
+    for name, field in vars(config).items():
+        for value in field if isinstance(field, tuple) else (field,):
+            if not isinstance(value, (int, float)):
+                continue
+            if not math.isfinite(value):
+                raise ValueError(f"{name} is {value}, expected a finite number")
+            if least and name in least and value < least[name]:
+                raise ValueError(f"{name} is {value:g}, expected at least {least[name]:g}")
+            if above and name in above and value <= above[name]:
+                raise ValueError(f"{name} is {value:g}, expected more than {above[name]:g}")
+            if name in ("seed", "seeds") and not 0 <= value <= LARGEST_SEED:
+                raise ValueError(f"{name} is {value}, expected 0 to {LARGEST_SEED}")
+
+
 def _parser(
     config: type, positional: Sequence[str], prog: str, description: str | None
 ) -> ArgumentParser:
@@ -129,7 +165,11 @@ def _parser(
 
     set_parsing_settings(docstring_parse_attribute_docstrings=True)
     parser = ArgumentParser(
-        prog=prog, description=description, exit_on_error=False, version=__version__
+        prog=prog,
+        description=description,
+        exit_on_error=False,
+        version=__version__,
+        allow_abbrev=False,
     )
     parser.add_argument("--config", action="config", help="YAML file with settings to start from.")
     parser.add_argument(
@@ -191,15 +231,23 @@ def _underscored(argument: str) -> str:
     return "--" + name[2:].replace("-", "_") + equals + value
 
 
-def _config_first(arguments: list[str]) -> list[str]:
-    """Move `--config FILE` to the front, so that it never overrides the command line."""
-    first, rest, words = [], [], iter(arguments)
+def _config_first(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Move `--config FILE` to the front, so that it never overrides the command line.
+
+    Returns all words, and the files among them.
+    """
+    files, rest, words = [], [], iter(arguments)
     for word in words:
         if word == "--config":
-            first += [word, *[value for value in [next(words, None)] if value is not None]]
+            file = next(words, None)
+            if file is None:
+                raise ValueError("--config: the file is missing")
+            files.append(file)
+        elif word.startswith("--config="):
+            files.append(word.removeprefix("--config="))
         else:
-            (first if word.startswith("--config=") else rest).append(word)
-    return first + rest
+            rest.append(word)
+    return [*(f"--config={file}" for file in files), *rest], files
 
 
 def _program_name() -> str:

@@ -3,8 +3,9 @@
 A run folder holds `config.yaml` (the resolved configuration, readable by `--config`),
 `versions.json` (command, date, git revision, packages, hardware) and, once the work is
 done, `results.json` (the printed table with all of that). Files are written under a
-temporary name and moved into place. JSON has no NaN: such a value is stored as null and
-its place listed under `non_finite`. Nothing heavy is imported here.
+temporary name and moved into place; `run_folder` does the same for whole runs. JSON has no
+NaN: such a value is stored as null and its place listed under `non_finite`. Nothing heavy is
+imported here.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -29,6 +31,7 @@ from tpcd.errors import FileError, RunError
 CONFIG_FILE = "config.yaml"
 VERSIONS_FILE = "versions.json"
 RESULTS_FILE = "results.json"
+ELSEWHERE = "name a place where you may write"
 PACKAGES = (
     "torch",
     "numpy",
@@ -49,28 +52,108 @@ PACKAGES = (
 def open_run(
     path: str | Path, command: str, config: Mapping[str, Any] | Any, overwrite: bool = False
 ) -> Path:
-    """Make a run folder that says what is about to run, and return it.
+    """Make a run folder that says what is about to run, and return it; see also `run_folder`.
 
     `command` names the program (`scripts/estimate.py`), `config` is its dataclass or a
     mapping. Raises `RunError` when the folder already holds something; with `overwrite`
     an earlier run there is removed, but never a folder that is not a run.
     """
-    import yaml
-
     folder = Path(path)
+    if _holds_run(folder, overwrite):
+        shutil.rmtree(folder)
+    return _started(folder, command, config)
+
+
+@contextmanager
+def run_folder(
+    path: str | Path,
+    command: str,
+    config: Mapping[str, Any] | Any,
+    overwrite: bool = False,
+    resumable: str | None = None,
+) -> Iterator[Path]:
+    """A run folder as `open_run` makes it that stays only if the work in it is done.
+
+    Where the body raises or is interrupted, what it wrote is removed and an earlier run
+    that it was to replace is put back. `resumable` names the file with which a stopped run
+    can go on (`continue_run`): once it is there, the run stays.
+    """
+    folder = Path(path).absolute()
+    aside = folder.with_name(f".{folder.name}.{os.getpid()}.earlier")
+    replacing = _holds_run(Path(path), overwrite)
+    was_there = folder.is_dir() and not replacing
+    new_parents = [parent for parent in folder.parents if not parent.exists()]
+    if replacing:
+        os.replace(folder, aside)
+    try:
+        yield _started(Path(path), command, config)
+    except BaseException as error:
+        if resumable and (folder / resumable).is_file():
+            shutil.rmtree(aside, ignore_errors=True)
+            if isinstance(error, KeyboardInterrupt):
+                raise KeyboardInterrupt(f"{path} goes on with --resume") from error
+            raise
+        shutil.rmtree(folder, ignore_errors=True)
+        if replacing:
+            os.replace(aside, folder)
+        elif was_there:
+            folder.mkdir()
+        for parent in new_parents:
+            with suppress(OSError):  # something else may have come into it
+                parent.rmdir()
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_target(path: str | Path, overwrite: bool = False) -> None:
+    """Refuse a file that could not be written in the end, before the work begins.
+
+    Raises `RunError` where it exists and `overwrite` is false, is a folder, or lies where
+    nothing can be written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise RunError(path, "is a folder", "name a file")
+    if path.exists() and not overwrite:
+        raise RunError(path, "exists already", "choose another name or pass --overwrite")
+    _check_place(path.parent)
+
+
+def _holds_run(folder: Path, overwrite: bool) -> bool:
+    """Whether an earlier run is to be replaced; `RunError` where nothing may be put there."""
     if folder.exists() and not folder.is_dir():
         raise RunError(folder, "is a file", "name a folder for the results")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not overwrite:
-            raise RunError(folder, "is not empty", "name a new folder or pass --overwrite")
-        if not (folder / VERSIONS_FILE).is_file():
-            raise RunError(
-                folder, f"is not a run (no {VERSIONS_FILE}), not overwritten", "name a new folder"
-            )
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        _check_place(folder)
+        return False
+    if not overwrite:
+        raise RunError(folder, "is not empty", "name a new folder or pass --overwrite")
+    if not (folder / VERSIONS_FILE).is_file():
+        raise RunError(
+            folder, f"is not a run (no {VERSIONS_FILE}), not overwritten", "name a new folder"
+        )
+    return True
+
+
+def _check_place(folder: Path) -> None:
+    """Refuse a folder that neither is one to write to nor can be made."""
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise RunError(folder, f"cannot be made: {there} is a file", "name another folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise RunError(folder, f"cannot be written: no permission in {there}", ELSEWHERE)
+
+
+def _started(folder: Path, command: str, config: Mapping[str, Any] | Any) -> Path:
+    """Make the folder and write what is about to run."""
+    import yaml
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(folder, f"cannot be made ({error.strerror})", ELSEWHERE) from error
     body = yaml.safe_dump(to_plain(config), sort_keys=False, allow_unicode=True)
-    _write_text(folder / CONFIG_FILE, f"# {command}\n{body}")
+    write_text(folder / CONFIG_FILE, f"# {command}\n{body}")
     write_json(folder / VERSIONS_FILE, {"command": command, **versions()})
     return folder
 
@@ -136,7 +219,7 @@ def write_json(path: str | Path, content: Any) -> Path:
     elif flagged:
         raise ValueError(f"{path}: not finite at {', '.join(flagged)}; wrap it in a mapping")
     text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
-    return _write_text(Path(path), text + "\n")
+    return write_text(Path(path), text + "\n")
 
 
 def read_json(path: str | Path) -> Any:
@@ -243,7 +326,8 @@ def _cell(value: Any, specification: str | None) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _write_text(path: Path, text: str) -> Path:
+def write_text(path: Path, text: str) -> Path:
+    """Write a file in UTF-8 in one move; its folder is made if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

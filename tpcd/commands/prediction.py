@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +20,7 @@ from torch import Tensor
 from tpcd.data.episode import Episode
 from tpcd.planar import wrap_angle
 from tpcd.predict import CHANNELS, ContactPredictor
+from tpcd.results import write_text
 
 CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
 ROLLOUT_SAMPLES = 400
@@ -139,7 +139,4 @@ def write_prediction(predicted: list[PredictedRows], path: Path) -> None:
         for step, values in enumerate(table.tolist(), start=1):
             lead = [number, step] if len(predicted) > 1 else [step]
             writer.writerow([*lead, *(repr(value) for value in values)])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    staged = path.with_name(f".{path.name}.staged")
-    staged.write_text(text.getvalue(), encoding="utf-8")
-    os.replace(staged, path)
+    write_text(path, text.getvalue())

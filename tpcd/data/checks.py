@@ -24,11 +24,15 @@ COMMAND_COLUMNS = ("u_x", "u_z", "u_phi")
 POSE_COLUMNS = ("x", "z", "phi")
 WRENCH_COLUMNS = ("F_x", "F_z", "tau")
 LARGEST_JUMP = 0.5
-"""Commands of neighbouring rows further apart than this [m] are taken for an error."""
+"""Commands, or poses, of neighbouring rows further apart than this [m] are taken for an error."""
+LARGEST_WRENCH = 1e4
+"""Forces and torques beyond this [N, N·m] are taken for millinewtons or a fault."""
 NOISE_FACTOR = 6.0
 """Differences beyond this many standard deviations are not noise (1 in 5e8 for a normal)."""
 ROUNDING = 1e-6
 """Start pose and command may differ by this much [m, rad] on top of noise: printed digits."""
+FREE_WRENCH = 1e-3
+"""The start wrench may differ from 0 by this much [N, N·m] on top of noise: printed digits."""
 
 
 def check_steps(path: Path, steps: np.ndarray) -> None:
@@ -61,41 +65,68 @@ def check_rows(
     wrenches: np.ndarray,
     sensor_std: np.ndarray,
 ) -> None:
-    """Refuse rows (n, 3) that are not finite, not SI, jump, or do not start at rest.
+    """Refuse rows (n, 3) that are not finite, not SI, jump, or do not start at rest and free.
 
     Raises `EpisodeError` naming row and column.
     """
+    length, angle = (LARGEST_LENGTH, "m", "millimetres"), (2 * math.pi, "rad", "degrees")
+    force, torque = (LARGEST_WRENCH, "N", "millinewtons"), (LARGEST_WRENCH, "N·m", "mN·m")
     columns = (
-        (COMMAND_COLUMNS, commands, True),
-        (POSE_COLUMNS, poses, True),
-        (WRENCH_COLUMNS, wrenches, False),
+        (COMMAND_COLUMNS, commands, (length, length, angle)),
+        (POSE_COLUMNS, poses, (length, length, angle)),
+        (WRENCH_COLUMNS, wrenches, (force, force, torque)),
     )
-    for names, values, is_pose in columns:
+    for names, values, limits in columns:
         for axis, name in enumerate(names):
-            _check_column(path, name, values[:, axis], axis, is_pose)
-    jumps = np.linalg.norm(np.diff(commands[:, :2], axis=0), axis=1)
-    if len(jumps) and jumps.max() > LARGEST_JUMP:
-        row = int(np.argmax(jumps > LARGEST_JUMP)) + 1
-        raise EpisodeError(
-            path,
-            f"{row_name(row, path)}, columns u_x, u_z: the command jumps by {jumps[row - 1]:.3g} m,"
-            f" expected at most {LARGEST_JUMP} m",
-            "check the frame of the commands, or split the episode there",
-        )
-    offset = np.abs(commands[0] - poses[0])
+            _check_column(path, name, values[:, axis], limits[axis])
+    _check_jumps(path, "command", COMMAND_COLUMNS, commands)
+    _check_jumps(path, "pose", POSE_COLUMNS, poses)
+    _check_start(path, commands[0], poses[0], wrenches[0], sensor_std)
+
+
+def _check_jumps(path: Path, what: str, names: tuple[str, ...], values: np.ndarray) -> None:
+    jumps = np.linalg.norm(np.diff(values[:, :2], axis=0), axis=1)
+    if not len(jumps) or jumps.max() <= LARGEST_JUMP:
+        return
+    row = int(np.argmax(jumps > LARGEST_JUMP)) + 1
+    raise EpisodeError(
+        path,
+        f"{row_name(row, path)}, columns {names[0]}, {names[1]}: the {what} jumps by"
+        f" {jumps[row - 1]:.3g} m, expected at most {LARGEST_JUMP} m",
+        f"check the frame of the {what}s, or split the episode there",
+    )
+
+
+def _check_start(
+    path: Path,
+    command: np.ndarray,
+    pose: np.ndarray,
+    wrench: np.ndarray,
+    sensor_std: np.ndarray,
+) -> None:
+    """Row 0 is at rest and free: the command is the pose, the wrench is noise."""
+    offset = np.abs(command - pose)
     offset[2] = abs(math.remainder(offset[2], 2 * math.pi))
     allowed = NOISE_FACTOR * sensor_std[:3] + ROUNDING
     for axis in np.flatnonzero(offset > allowed):
         raise EpisodeError(
             path,
-            f"{row_name(0, path)}, column {COMMAND_COLUMNS[axis]}: found {commands[0, axis]:.6g},"
-            f" expected the start pose {POSE_COLUMNS[axis]} = {poses[0, axis]:.6g}"
+            f"{row_name(0, path)}, column {COMMAND_COLUMNS[axis]}: found {command[axis]:.6g},"
+            f" expected the start pose {POSE_COLUMNS[axis]} = {pose[axis]:.6g}"
             f" within {allowed[axis]:.2g}",
             "start free of contact and set command 0 to the measured pose",
         )
+    noise = NOISE_FACTOR * sensor_std[3:] + FREE_WRENCH
+    for axis in np.flatnonzero(np.abs(wrench) > noise):
+        raise EpisodeError(
+            path,
+            f"{row_name(0, path)}, column {WRENCH_COLUMNS[axis]}: found {wrench[axis]:.4g} at the"
+            f" start pose, expected 0 within {noise[axis]:.2g}",
+            "start free of contact and zero the sensor there",
+        )
 
 
-def _check_column(path: Path, name: str, column: np.ndarray, axis: int, is_pose: bool) -> None:
+def _check_column(path: Path, name: str, column: np.ndarray, limit: tuple[float, str, str]) -> None:
     finite = np.isfinite(column)
     if not finite.all():
         row = int(np.argmin(finite))
@@ -104,11 +135,7 @@ def _check_column(path: Path, name: str, column: np.ndarray, axis: int, is_pose:
             f"{row_name(row, path)}, column {name}: found {column[row]}, expected a finite number",
             "drop the step from the recording or measure it again",
         )
-    if not is_pose:
-        return
-    largest, unit, likely = (
-        (2 * math.pi, "rad", "degrees") if axis == 2 else (LARGEST_LENGTH, "m", "millimetres")
-    )
+    largest, unit, likely = limit
     if len(column) and np.abs(column).max() > largest:
         row = int(np.argmax(np.abs(column) > largest))
         raise EpisodeError(
@@ -152,10 +179,6 @@ def check_episode(episode: Episode) -> list[str]:
             )
     if not significant.any():
         warnings.append("no step shows contact beyond the noise: nothing can be learnt from it")
-    start = np.abs(wrenches[0]) > NOISE_FACTOR * noise[3:] + 1e-9
-    if noise[3:].any() and start.any():
-        names = ", ".join(np.array(WRENCH_COLUMNS)[start])
-        warnings.append(f"row 0 shows {names} beyond noise: it must be free; zero the sensor there")
     silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
     if silent:
         warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")

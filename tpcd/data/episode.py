@@ -229,9 +229,13 @@ def _locate(path: Path) -> tuple[Path, Path]:
     stem = _stem(path)
     tables = [_add(stem, suffix) for suffix in TABLE_SUFFIXES if _add(stem, suffix).is_file()]
     if path.suffix in TABLE_SUFFIXES:
+        if not path.is_file():
+            raise EpisodeError(path, "no such file", "give NAME.csv, NAME.parquet or their folder")
         return path, _add(stem, ".yaml")
     if len(tables) > 1:
         raise EpisodeError(stem, "has both a .csv and a .parquet table", "name one of them")
+    if not tables and path.is_file() and path.suffix != ".yaml":
+        raise EpisodeError(path, "is no .csv or .parquet table", "export the episode as CSV")
     if not tables:
         missing = _add(stem, ".csv")
         raise EpisodeError(missing, "no such file", "give NAME.csv, NAME.parquet or their folder")

@@ -51,12 +51,31 @@ def read_header(path: Path) -> Header:
             "write one with the keys stiffness and sensor_std",
         )
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        content = yaml.load(path.read_text(encoding="utf-8-sig"), _UniqueKeys)
+    except UnicodeDecodeError as error:
+        raise EpisodeError(path, "not a UTF-8 text file", "save it in UTF-8") from error
+    except _RepeatedKey as error:
+        raise EpisodeError(path, f"key {error} appears twice", "remove one of them") from error
+    except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         raise EpisodeError(path, f"not valid YAML{where}", "correct it by hand") from error
     return parse_header(content, path)
+
+
+class _RepeatedKey(yaml.YAMLError):
+    """A key that a mapping holds twice."""
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Plain YAML, in which the second of two equal keys does not silently win."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        repeated = [key for key in keys if keys.count(key) > 1]
+        if repeated:
+            raise _RepeatedKey(repeated[0])
+        return super().construct_mapping(node, deep)
 
 
 def parse_header(content: Any, path: Path) -> Header:

@@ -1,0 +1,91 @@
+"""What a user reads when a command line is wrong, in place of the parser's own words.
+
+A message says which setting it is about, what was found, what is expected, and, where a
+name was misspelt, which one was probably meant.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from tpcd.errors import FileError
+
+KINDS = {"int": "a whole number", "float": "a finite number", "bool": "true or false"}
+REMEDIES = {
+    errno.EACCES: "choose a place where you may read and write",
+    errno.EPERM: "choose a place where you may read and write",
+    errno.EROFS: "choose a place where you may write",
+    errno.ENOSPC: "free some space",
+    errno.ENOTDIR: "a file stands where a folder is needed",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+def parsing_problem(message: str, names: Iterable[str]) -> str:
+    """The parser's message in plain words; `names` are the settings that exist."""
+    message = " ".join(message.split())
+    names = list(names)
+    if found := re.match(r'Parser key "([\w.]+)"( element \d+)?: (.*)', message):
+        return f"{found[1]}: {_wrong_value(found[3])}"
+    if found := re.match(r"the following arguments are required: (.*)", message):
+        missing = [name if name.startswith("-") else f"--{name}" for name in found[1].split(", ")]
+        return f"{' and '.join(missing)} missing"
+    if found := re.match(r"unrecognized arguments: (\S+)", message):
+        name = found[1].partition("=")[0]
+        if not name.startswith("--"):
+            return f"{name}: one argument too many"
+        return f"unknown option {name}{_meant(name.lstrip('-'), names, '--')}"
+    if found := re.match(r"Option '([\w.]+)' is not accepted", message):
+        return f"unknown setting {found[1]!r} in the configuration{_meant(found[1], names)}"
+    return message
+
+
+def system_problem(error: OSError) -> str:
+    """An error of the operating system with the file in front and what to do behind."""
+    if error.filename is None or error.strerror is None:
+        return " ".join(str(error).split()) or type(error).__name__
+    remedy = REMEDIES.get(error.errno or 0)
+    return f"{error.filename}: {error.strerror}" + (f"; {remedy}" if remedy else "")
+
+
+def check_config_files(paths: Sequence[str]) -> None:
+    """Refuse a configuration that is missing or no mapping of settings, by `FileError`."""
+    import yaml
+
+    for name in paths:
+        path, remedy = Path(name), "give a YAML file of settings such as config.yaml of a run"
+        if not path.is_file():
+            raise FileError(path, "no such file", remedy)
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+        except UnicodeDecodeError as error:
+            raise FileError(path, "not a UTF-8 text file", remedy) from error
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            where = f" at line {mark.line + 1}" if mark else ""
+            raise FileError(path, f"not valid YAML{where}", "correct it by hand") from error
+        if not isinstance(content, dict):
+            found = "nothing" if content is None else f"a {type(content).__name__}"
+            raise FileError(path, f"holds {found}, expected settings by name", remedy)
+
+
+def _wrong_value(problem: str) -> str:
+    value = re.search(r"(?:Got|Given) value: (.*)$", problem)
+    if value is None:
+        return problem
+    if literal := re.search(r"Literal\[(.*?)\]", problem):
+        expected = f"one of {literal[1]}"
+    else:
+        kinds = dict.fromkeys(re.findall(r"<class '(\w+)'>", problem))
+        kinds.pop("NoneType", None)
+        expected = " or ".join(KINDS.get(kind, kind) for kind in kinds) or "another value"
+    return f"found {value[1]!r}, expected {expected}"
+
+
+def _meant(name: str, names: Sequence[str], prefix: str = "") -> str:
+    close = difflib.get_close_matches(name.replace("-", "_"), names, 1, 0.6)
+    return f"; did you mean {prefix}{close[0]}?" if close else ""

@@ -46,13 +46,9 @@ class SamplerSettings:
     """Share of the effective sample size that one temperature step keeps."""
     components: int = 8
     """Components of the fitted mixture."""
-    least_moves: int = 2
-    """Fewest moves of every particle after each temperature."""
-    most_moves: int = 8
-    """Most moves of every particle after each temperature."""
-    moved_share: float = 0.98
-    """Moves stop early once this share of the particles has left its place."""
-    final_moves: int = 4
+    tempering_moves: int = 4
+    """Moves of every particle after each temperature but the last."""
+    final_moves: int = 8
     """Moves at full likelihood once the datum is in."""
     independent_share: float = 0.5
     """Share of moves that are independent draws from the mixture; the rest are local steps."""
@@ -64,11 +60,13 @@ class SamplerSettings:
                 f"particles {self.particles} must be >= 16, kept_share {self.kept_share} in "
                 f"(0, 1), components {self.components} >= 1"
             )
-        if not 0 <= self.least_moves <= self.most_moves or not 0 <= self.independent_share <= 1:
+        if min(self.tempering_moves, self.final_moves) < 0:
             raise ValueError(
-                f"expected 0 <= least_moves ({self.least_moves}) <= most_moves "
-                f"({self.most_moves}) and independent_share ({self.independent_share}) in [0, 1]"
+                f"tempering_moves {self.tempering_moves} and final_moves {self.final_moves} "
+                "must be >= 0"
             )
+        if not 0 <= self.independent_share <= 1:
+            raise ValueError(f"independent_share is {self.independent_share}, expected 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -270,12 +268,8 @@ def _move(
     tally: _Tally,
 ) -> _State:
     """Metropolis-Hastings moves that leave the tempered posterior invariant."""
-    still = torch.ones(len(state.before), dtype=torch.bool)
-    fewest = settings.final_moves if last else settings.least_moves
     share_independent = settings.independent_share
-    for move in range(settings.most_moves):
-        if move >= fewest and float(still.double().mean()) <= 1 - settings.moved_share:
-            break
+    for move in range(settings.final_moves if last else settings.tempering_moves):
         # Independent moves come due at their share of all moves so far, the first one first.
         due = math.ceil((move + 1) * share_independent) - math.ceil(move * share_independent)
         independent = due > 0
@@ -310,7 +304,6 @@ def _move(
             torch.where(accepted, before, state.before),
             torch.where(accepted, with_datum, state.with_datum),
         )
-        still = still & ~accepted
         tally.count("independent" if independent else "local", len(here), int(accepted.sum()))
     return state
 

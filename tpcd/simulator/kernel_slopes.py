@@ -14,7 +14,6 @@ import numpy as np
 from numba import njit
 
 from tpcd.simulator.kernel_geometry import object_normal
-from tpcd.simulator.kernel_settle import respond
 
 GRAZING = 1e-9
 """Share of the way's motion towards a terrain below which a touch only grazes it."""
@@ -26,7 +25,7 @@ class Slopes(NamedTuple):
     `whole` (3 + 2 t, 3) of the step so far by the start, then rows by gaps, then by levers;
     `kept` a copy of it; `land` (6, 3) of the first touch by start and command, `land_gap`
     (t, 3) by gaps; `response` (6, 3) of one settling by start and command, `by_terrain`
-    (2 t, 3) rows by gaps and by levers.
+    (2 t, 3) rows by gaps and by levers, `follow` and `yields` (3, 3) to get them with.
     """
 
     whole: np.ndarray
@@ -35,6 +34,8 @@ class Slopes(NamedTuple):
     land_gap: np.ndarray
     response: np.ndarray
     by_terrain: np.ndarray
+    follow: np.ndarray
+    yields: np.ndarray
 
 
 @njit
@@ -48,6 +49,8 @@ def new_slopes(terrains):
         np.zeros((terrains, 3)),
         np.zeros((6, 3)),
         np.zeros((2 * terrains, 3)),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
     )
 
 
@@ -86,31 +89,35 @@ def landing_response(world, o, start, command, fraction, point, terrain, slopes)
 @njit(_nrt=False)
 @no_type_check
 def settling_response(law, terrains, space, slopes):
-    """Derivatives of the settled pose by start, command, and gap and lever of each terrain."""
-    force, right = space.force, space.right
-    for c in range(3):
+    """Derivatives of the settled pose by start, command, and gap and lever of each terrain.
+
+    A force on the balance and right-hand sides of the rows change the pose by
+    `yields` force + `follow` right, as `respond` does for one of each.
+    """
+    system, chosen, follow, yields = space.system, space.chosen, slopes.follow, slopes.yields
+    for a in range(3):
         for j in range(3):
-            force[j], right[j] = 0.0, -space.system[12 + j, c]
-        respond(space)
-        for a in range(3):
-            slopes.response[a, c] = space.change[a]
-            right[a] = 0.0
-        force[c] = law.stiffness[c]
-        respond(space)
-        for a in range(3):
-            slopes.response[3 + a, c] = space.change[a]
-    for t in range(terrains):
-        for j in range(3):
-            force[j] = 0.0
-            right[j] = -1.0 if (space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t) else 0.0
-        respond(space)
-        for a in range(3):
-            slopes.by_terrain[t, a] = space.change[a]
-            right[a] = 0.0
-        force[2] = space.load[t]
-        respond(space)
-        for a in range(3):
-            slopes.by_terrain[terrains + t, a] = space.change[a]
+            value = 0.0
+            for i in range(3):
+                value += system[3 + i, a] * system[9 + i, j]
+            follow[a, j] = system[6, a] * value
+    for a in range(3):
+        for c in range(3):
+            value = system[6, a] if a == c else 0.0
+            by_start = 0.0
+            for j in range(3):
+                value -= follow[a, j] * system[j, c] * system[6, c]
+                by_start -= follow[a, j] * system[12 + j, c]
+            yields[a, c] = value
+            slopes.response[a, c] = by_start
+            slopes.response[3 + a, c] = value * law.stiffness[c]
+        for t in range(terrains):
+            value = 0.0
+            for j in range(3):
+                if chosen[j, 0] >= 0 and chosen[j, 1] == t:
+                    value -= follow[a, j]
+            slopes.by_terrain[t, a] = value
+            slopes.by_terrain[terrains + t, a] = yields[a, 2] * space.load[t]
 
 
 @njit(_nrt=False)

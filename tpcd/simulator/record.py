@@ -52,7 +52,7 @@ class StepSettings:
     friction: Literal["coulomb", "anitescu"] = "coulomb"
     """`anitescu` is the convex relaxation (a sliding body is lifted by friction x slip);
     `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
-    substeps: int = 4
+    substeps: int = 2
     """Parts into which the command's path is cut where contact with floor or wall is won or
     lost on the way, since friction then depends on the path; other steps are one part."""
     follow_path: bool = False

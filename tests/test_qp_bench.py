@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from eval.bench.contact_problems import ContactRecipe, random_contact_problems
 from eval.bench.qp import Benchmark, benchmark
@@ -35,7 +36,15 @@ def test_the_quick_run_prints_and_writes_a_table_without_wrong_answers(tmp_path,
         assert lines[name]["error_n"] < 1e-8
         assert lines[name]["seconds"] > 0
     assert results["seeds"] == [0] and results["config"]["rows"] == [4]
-    assert list((tmp_path / "run").glob("events.out.tfevents.*"))
+    assert {"hardware", "packages"} <= results["versions"].keys()
+    assert (tmp_path / "run" / "figures" / "solver_seconds.png").stat().st_size > 5000
+    log = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    logged = log.Scalars("seconds/native")
+    assert [(event.step, event.value) for event in logged] == [
+        (4, pytest.approx(lines["native"]["seconds"]))
+    ]
+    assert log.Tags()["images"] == ["solver_seconds"]
+    assert "table/text_summary" in log.Tags()["tensors"]
     with pytest.raises(RunError, match="--overwrite"):
         benchmark(config)
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tpcd.contact import ContactScene, place_points, scene_from_parameters
+from tpcd.contact import ContactScene, column_scene, place_points, scene_from_parameters
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES, Parameters
 from tpcd.planar import wrap_angle
 from tpcd.qp import ContactQP, solve

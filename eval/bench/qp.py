@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,7 +39,7 @@ class Benchmark:
     """What to time, on how many problems."""
 
     out: Path = Path("runs/bench_qp")
-    """Folder for results.json and the TensorBoard log."""
+    """Folder for results.json, the figure and the TensorBoard log."""
     problems: int = 25_000
     """Problems of each size."""
     rows: tuple[int, ...] = (8, 16, 20)
@@ -59,8 +59,7 @@ class Benchmark:
 
     def __post_init__(self) -> None:
         """Refuse numbers that no benchmark can be made of."""
-        if self.problems < 1 or self.threads < 1:
-            raise ValueError("problems and threads must be at least 1")
+        check_numbers(self, least={"problems": 1, "threads": 1}, above={"wrong_above": 0.0})
         if not self.rows or any(rows < 2 or rows % 2 for rows in self.rows):
             raise ValueError(f"rows is {self.rows}, expected even numbers: two for each contact")
 
@@ -68,17 +67,29 @@ class Benchmark:
 def benchmark(config: Benchmark) -> None:
     """Print seconds, force errors and failures of every contact QP solver that is installed."""
     import torch
-    from torch.utils.tensorboard import SummaryWriter
 
-    from eval.bench.contact_problems import random_contact_problems
-    from eval.bench.qp_solvers import available_solvers, reference_forces
     from tpcd.errors import SolverError
-    from tpcd.results import format_table, open_run, write_results
+    from tpcd.results import run_folder
 
     torch.set_num_threads(config.threads)
     if torch.device(config.device).type == "cuda" and not torch.cuda.is_available():
         raise SolverError(f"device is {config.device}, but no CUDA device is here; use cpu")
-    folder = open_run(config.out, "python -m eval.bench.qp", config, config.overwrite)
+    with run_folder(config.out, "python -m eval.bench.qp", config, config.overwrite) as folder:
+        compare_solvers(config, folder)
+    print(f"\nwritten to {config.out}")
+
+
+def compare_solvers(config: Benchmark, folder: Path) -> None:
+    """The benchmark in an opened run folder."""
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+
+    from eval.bench.contact_problems import random_contact_problems
+    from eval.bench.figures import solver_seconds
+    from eval.bench.qp_solvers import available_solvers, reference_forces
+    from tpcd.figures.sinks import save_figure
+    from tpcd.results import format_table, write_results
+
     count = min(config.problems, QUICK_PROBLEMS) if config.quick else config.problems
     table: list[dict[str, Any]] = []
     sources = set()
@@ -87,12 +98,12 @@ def benchmark(config: Benchmark) -> None:
         forces, source = reference_forces(problem)
         sources.add(source)
         for solver in available_solvers(config.device):
-            print(f"\r{rows} rows: {solver.name:<20}", end="", file=sys.stderr, flush=True)
+            _show_progress(f"{rows} rows: {solver.name}")
             table.append({"rows": rows, **measure(solver, problem, forces, config)})
     if len(config.rows) > 1:
         table += totals(table)
     _add_ratios(table)
-    print("\r" + " " * 40 + "\r", end="", file=sys.stderr, flush=True)
+    _show_progress("")
     print(format_table(table, formats=FORMATS))
     clock = "CPU" if torch.device(config.device).type == "cpu" else "wall-clock"
     note = (
@@ -105,13 +116,20 @@ def benchmark(config: Benchmark) -> None:
     )
     print("\n" + note)
     write_results(folder, table, seeds=[config.seed], note=note)
-    with SummaryWriter(str(folder)) as writer:
+    with SummaryWriter(folder / "tensorboard") as writer:
+        figure = solver_seconds(table, count, clock)
+        save_figure(figure, folder / "figures", "solver_seconds", writer)
         for line in table:
             for quantity in ("seconds", "error_n", "wrong", "failed"):
                 if line[quantity] is not None and line["rows"] != "all":
                     writer.add_scalar(f"{quantity}/{line['solver']}", line[quantity], line["rows"])
         writer.add_text("table", "```\n" + format_table(table, formats=FORMATS) + "\n```")
-    print(f"\nwritten to {folder}")
+        writer.add_text("note", note)
+
+
+def _show_progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{text:<40}\r{text}", end="", file=sys.stderr, flush=True)
 
 
 def measure(

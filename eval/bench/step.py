@@ -17,11 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+COMMAND = "python -m eval.bench.step"
+TARGET = (5000, 0.15)
+"""Particles, and the wall seconds that a step of memory 5 should stay below on 2 cores."""
 FORMATS = {"cpu_s": ".4f", "wall_s": ".4f", "us_each": ".2f", "solved": ".2%"}
 
 
@@ -30,7 +33,7 @@ class Benchmark:
     """What to time, at which size."""
 
     out: Path = Path("runs/bench_step")
-    """Folder for results.json."""
+    """Folder for results.json, figures and the TensorBoard log."""
     prior: str = "ycb21-z2"
     """Shape prior, by name or folder."""
     particles: int = 5000
@@ -56,25 +59,41 @@ class Benchmark:
 
     def __post_init__(self) -> None:
         """Refuse numbers that no benchmark can be made of."""
-        numbers = (self.particles, self.memory, self.repeats, self.threads)
-        if min(*numbers, *self.curve_particles, *self.curve_points) < 1:
-            raise ValueError("particles, memory, points, repeats and threads must be at least 1")
+        names = ("particles", "memory", "repeats", "threads", "curve_particles", "curve_points")
+        check_numbers(self, least=dict.fromkeys(names, 1))
+        if not self.curve_particles or not self.curve_points:
+            raise ValueError(
+                "a curve is empty, expected at least one number of particles or points"
+            )
 
 
 def benchmark(config: Benchmark) -> None:
     """Print the seconds of each part of a filter step, and the curves."""
     import torch
 
-    from eval.bench.filter_step import filter_step_parts, model_rows, outline_rows
     from tpcd.errors import SolverError
-    from tpcd.results import format_table, open_run, write_results
-    from tpcd.shape.checkpoint import load_prior
+    from tpcd.results import run_folder
 
     torch.set_num_threads(config.threads)
     device = torch.device(config.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise SolverError(f"device is {config.device}, but no CUDA device is here; use cpu")
-    folder = open_run(config.out, "eval.bench.step", config, config.overwrite)
+    with run_folder(config.out, COMMAND, config, config.overwrite) as folder:
+        time_parts(config, folder)
+
+
+def time_parts(config: Benchmark, folder: Path) -> None:
+    """The benchmark in an opened run folder."""
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+
+    from eval.bench.figures import part_seconds, step_seconds
+    from eval.bench.filter_step import filter_step_parts, model_rows, outline_rows
+    from tpcd.figures.sinks import save_figure
+    from tpcd.results import format_table, write_results
+    from tpcd.shape.checkpoint import load_prior
+
+    device = torch.device(config.device)
     shape = load_prior(config.prior)
     particles = 200 if config.quick else config.particles
     sizes = (100, 200) if config.quick else config.curve_particles
@@ -83,16 +102,33 @@ def benchmark(config: Benchmark) -> None:
     def timed(work: Callable[[], Any]) -> dict[str, float]:
         return fastest(work, 1 if config.quick else config.repeats, device.type == "cuda")
 
-    table = filter_step_parts(shape, particles, config.memory, config.seed, device, timed)
-    table += model_rows(shape, particles, config.memory, config.seed, device, timed)
+    step = filter_step_parts(shape, particles, config.memory, config.seed, device, timed)
+    models = model_rows(shape, particles, config.memory, config.seed, device, timed)
+    curve = []
     for size in sizes:
         parts = filter_step_parts(shape, size, config.memory, config.seed, device, timed)
-        table += [{**row, "curve": "particles"} for row in parts if row["part"] == "filter step"]
-    table += outline_rows(particles, config.memory, points, config.seed, device, timed)
+        curve += [{**row, "curve": "particles"} for row in parts if row["part"] == "filter step"]
+    outlines = outline_rows(particles, config.memory, points, config.seed, device, timed)
+    table = [*step, *models, *curve, *outlines]
     columns = ("part", "particles", "transitions", "points", "cpu_s", "wall_s", "us_each", "solved")
-    print(format_table(table, columns, FORMATS))
+    text = format_table(table, columns, FORMATS)
+    print(text)
+    figures = folder / "figures"
+    with SummaryWriter(folder / "tensorboard") as writer:
+        target = TARGET if config.memory == 5 else None
+        save_figure(step_seconds(curve, target), figures, "step_seconds", writer)
+        save_figure(part_seconds([*step, *models]), figures, "part_seconds", writer)
+        for clock in ("wall_s", "cpu_s"):
+            for row in curve:
+                writer.add_scalar(f"filter_step/{clock}", row[clock], row["particles"])
+            for row in outlines:
+                writer.add_scalar(f"outline_points/{clock}", row[clock], row["points"])
+        writer.add_text("table", f"```\n{text}\n```")
     path = write_results(folder, table, seeds=[config.seed])
-    print(f"\nTarget: a filter step of M = 5000, N = 5 within 0.15 s on 2 cores. Wrote {path}")
+    count, seconds = TARGET
+    print(
+        f"\nTarget: a filter step of M = {count}, N = 5 within {seconds} s on 2 cores. Wrote {path}"
+    )
 
 
 def fastest(work: Callable[[], Any], repeats: int, synchronise: bool) -> dict[str, float]:

@@ -42,6 +42,7 @@ def estimate_episode(config: Estimate) -> None:
     from contextlib import nullcontext
 
     import torch
+    from torch.utils.tensorboard import SummaryWriter
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
     from tpcd.belief.state import STATE_FILE, load_state
@@ -91,7 +92,10 @@ def estimate_episode(config: Estimate) -> None:
             }
             for name, entry in summarise(belief)["parameters"].items()
         ]
-        print(format_table(table))
+        text = format_table(table)
+        print(text)
+        with SummaryWriter(folder / "tensorboard") as writer:
+            writer.add_text("table", f"```\n{text}\n```")
         write_results(folder, table, seeds=[config.seed])
     print(
         f"\nresults in {config.out}; next: python scripts/predict.py {config.out} EPISODE"

@@ -255,7 +255,7 @@ def test_a_writer_gets_the_same_image_with_its_step(tmp_path: Path) -> None:
     recorder = Recorder()
     path = figures.save_figure(moved(), tmp_path, "scene", recorder, step=4)
     ((tag, shape, dtype, step, layout),) = recorder.images
-    assert (tag, step, layout, dtype) == ("scene", 4, "HWC", np.uint8)
+    assert (tag, step, layout, dtype) == ("figures/scene", 4, "HWC", np.uint8)
     assert shape == (*imread(path).shape[:2], 3)
 
 
@@ -276,3 +276,12 @@ def test_a_missing_error_leaves_a_gap() -> None:
     (panel,) = figures.error_bars(rows, {"x_mm": "error of x [mm]"}).axes
     lengths = [patch.get_width() for patch in panel.patches]
     assert np.isnan(lengths[0]) and lengths[1] == 1.0
+
+
+def test_labels_name_the_unit_shown_and_keep_subscripts() -> None:
+    from tpcd.figures.style import axis_label
+
+    assert axis_label("floor_height", "m") == "floor height [mm]"
+    assert axis_label("mount_phi", "rad") == "mount phi [°]"
+    assert axis_label("$F_x$", "N") == "$F_x$ [N]"
+    assert axis_label("scale", "1") == "scale [–]"

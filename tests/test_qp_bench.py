@@ -39,11 +39,11 @@ def test_the_quick_run_prints_and_writes_a_table_without_wrong_answers(tmp_path,
     assert {"hardware", "packages"} <= results["versions"].keys()
     assert (tmp_path / "run" / "figures" / "solver_seconds.png").stat().st_size > 5000
     log = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
-    logged = log.Scalars("seconds/native")
+    logged = log.Scalars("seconds_by_rows/native")
     assert [(event.step, event.value) for event in logged] == [
         (4, pytest.approx(lines["native"]["seconds"]))
     ]
-    assert log.Tags()["images"] == ["solver_seconds"]
+    assert log.Tags()["images"] == ["figures/solver_seconds"]
     assert "table/text_summary" in log.Tags()["tensors"]
     with pytest.raises(RunError, match="--overwrite"):
         benchmark(config)

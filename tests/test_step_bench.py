@@ -31,9 +31,9 @@ def test_the_quick_run_times_every_part_and_draws_the_curve(tmp_path, capsys):
     for name in ("step_seconds", "part_seconds"):
         assert (folder / "figures" / f"{name}.png").stat().st_size > 5000
     log = EventAccumulator(str(folder / "tensorboard")).Reload()
-    assert [event.step for event in log.Scalars("filter_step/wall_s")] == [100, 200]
-    assert [event.step for event in log.Scalars("outline_points/cpu_s")] == [16, 64]
-    assert sorted(log.Tags()["images"]) == ["part_seconds", "step_seconds"]
+    assert [event.step for event in log.Scalars("filter_step_by_particles/wall_s")] == [100, 200]
+    assert [event.step for event in log.Scalars("f_theta_by_outline_points/cpu_s")] == [16, 64]
+    assert sorted(log.Tags()["images"]) == ["figures/part_seconds", "figures/step_seconds"]
 
 
 def test_the_fastest_run_counts_and_the_first_does_not():

@@ -32,6 +32,13 @@ FORMATS = {
     "error_n": ".1e",
     "solved": ".2%",
 }
+TAGS = {
+    "seconds": "seconds_by_rows",
+    "error_n": "largest_force_error_N_by_rows",
+    "wrong": "wrong_answers_by_rows",
+    "failed": "failed_by_rows",
+}
+"""Columns of the table that TensorBoard gets as scalars, with the number of rows as step."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +127,9 @@ def compare_solvers(config: Benchmark, folder: Path) -> None:
         figure = solver_seconds(table, count, clock)
         save_figure(figure, folder / "figures", "solver_seconds", writer)
         for line in table:
-            for quantity in ("seconds", "error_n", "wrong", "failed"):
+            for quantity, group in TAGS.items():
                 if line[quantity] is not None and line["rows"] != "all":
-                    writer.add_scalar(f"{quantity}/{line['solver']}", line[quantity], line["rows"])
+                    writer.add_scalar(f"{group}/{line['solver']}", line[quantity], line["rows"])
         writer.add_text("table", "```\n" + format_table(table, formats=FORMATS) + "\n```")
         writer.add_text("note", note)
 

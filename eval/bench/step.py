@@ -120,9 +120,9 @@ def time_parts(config: Benchmark, folder: Path) -> None:
         save_figure(part_seconds([*step, *models]), figures, "part_seconds", writer)
         for clock in ("wall_s", "cpu_s"):
             for row in curve:
-                writer.add_scalar(f"filter_step/{clock}", row[clock], row["particles"])
+                writer.add_scalar(f"filter_step_by_particles/{clock}", row[clock], row["particles"])
             for row in outlines:
-                writer.add_scalar(f"outline_points/{clock}", row[clock], row["points"])
+                writer.add_scalar(f"f_theta_by_outline_points/{clock}", row[clock], row["points"])
         writer.add_text("table", f"```\n{text}\n```")
     path = write_results(folder, table, seeds=[config.seed])
     count, seconds = TARGET

@@ -31,7 +31,8 @@ def save_figure(
 ) -> Path:
     """Write `folder/name.png`, and the same image to TensorBoard where a writer is given.
 
-    `name` is a file name without its ending. The file appears complete or not at all.
+    `name` is a file name without its ending; the tag `figures/name` puts all figures of a run
+    under one heading. The file appears complete or not at all.
     """
     if not name or Path(name).name != name:
         raise ValueError(f"name of a figure is {name!r}, expected a file name without a folder")
@@ -47,5 +48,5 @@ def save_figure(
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         image = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        writer.add_image(name, image, step, dataformats="HWC")
+        writer.add_image(f"figures/{name}", image, step, dataformats="HWC")
     return path

@@ -47,7 +47,7 @@ def display_unit(unit: str) -> tuple[float, str]:
 def axis_label(name: str, unit: str) -> str:
     """A readable axis label with the unit it is shown in: `floor height [mm]`."""
     shown = display_unit(unit)[1]
-    words = name.replace("_", " ")
+    words = name if "$" in name else name.replace("_", " ")  # $F_x$ keeps its subscript
     return f"{words} [{shown}]" if shown else f"{words} [–]"
 
 

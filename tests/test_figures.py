@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.path import Path as Outline
@@ -128,6 +129,20 @@ def test_every_figure_is_written_as_an_image_with_content(
         assert min(image.shape[:2]) > 300
         assert image[..., :3].std() > 0.02, name
     assert len(list((tmp_path / "figures").iterdir())) == 6
+
+
+def test_nothing_of_a_figure_is_cut_off(generator: np.random.Generator) -> None:
+    """Regression: the legend of a scene without known truth was wider than the figure."""
+    drawn = all_figures(generator)
+    drawn["unknown"] = moved(true_floor=None, true_wall=None)
+    far = np.stack((np.linspace(0, 0.6, 8), np.full(8, 0.05), np.zeros(8)), axis=1)
+    drawn["long"] = moved(poses=far, commands=far)
+    for name, figure in drawn.items():
+        FigureCanvasAgg(figure).draw()
+        extent = figure.get_tightbbox().padded(-0.01)
+        width, height = figure.get_size_inches()
+        assert extent.x0 >= 0 and extent.y0 >= 0, name
+        assert extent.x1 <= width and extent.y1 <= height, name
 
 
 def test_lengths_are_drawn_in_millimetres_and_angles_in_degrees(

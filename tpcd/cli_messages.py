@@ -80,7 +80,7 @@ def _wrong_value(problem: str) -> str:
     if literal := re.search(r"Literal\[(.*?)\]", problem):
         expected = f"one of {literal[1]}"
     else:
-        kinds = dict.fromkeys(re.findall(r"<class '(\w+)'>", problem))
+        kinds: dict[str, None] = dict.fromkeys(re.findall(r"<class '(\w+)'>", problem))
         kinds.pop("NoneType", None)
         expected = " or ".join(KINDS.get(kind, kind) for kind in kinds) or "another value"
     return f"found {value[1]!r}, expected {expected}"

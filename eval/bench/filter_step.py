@@ -19,6 +19,7 @@ from tpcd.planar import wrap_angle
 from tpcd.qp import ContactQP, solve
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
+from tpcd.simulator.step import Engine
 from tpcd.terrain import floor, wall
 
 STIFFNESS = (100.0, 100.0, 50.0)
@@ -179,7 +180,9 @@ def contact_problem(work: Work, device: torch.device) -> ContactQP:
     return replace(problem, **moved)
 
 
-def _simulate(scene: ContactScene, work: Work, settings: StepSettings, engine: str) -> Transition:
+def _simulate(
+    scene: ContactScene, work: Work, settings: StepSettings, engine: Engine
+) -> Transition:
     return simulate_step(scene, work.start, work.command, work.stiffness, settings, engine=engine)
 
 

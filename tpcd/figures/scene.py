@@ -80,12 +80,15 @@ def scene(
     if true_wall is not None:
         entries["true surface"] = panel.axvline(1e3 * true_wall, **dashed)
     panel.set_aspect("equal")
+    # As high as the drawing needs, so that a long flat path leaves no empty bands.
+    width, height = panel.get_xlim()[1] - panel.get_xlim()[0], high[1] - low[1] + 2 * spare
+    figure.set_figheight(float(np.clip(5.6 * height / width + 0.6, 2.4, 6.4)))
     panel.set_xlabel("x in the world [mm]")
     panel.set_ylabel("z in the world [mm]")
     # Legend keys of drawn vertical lines are vertical; this one stands for both surfaces.
     if "true surface" in entries:
         entries["true surface"] = Line2D([], [], **dashed)
-    legend_below(figure, entries)
+    legend_below(figure, entries, columns=3)
     return figure
 
 

@@ -1,0 +1,215 @@
+"""Closed forms of contacts with floor and wall, for both engines."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from contact_scenes import (
+    BOX,
+    SLAB,
+    STIFFNESS,
+    make_scene,
+    outline_points,
+    random_transitions,
+    rotated,
+    scene_floor,
+    scene_wall,
+    vector,
+)
+from simulator_steps import CLOSE, ENGINES, FRICTIONS, SIDES, assert_near, step
+
+from tpcd.contact import ContactScene
+from tpcd.planar import rotate, transform_points
+from tpcd.simulator import ContactMode, StepSettings, StepStatus, simulate_step
+from tpcd.terrain import HalfPlane, floor, wall
+
+# One contact
+
+
+@ENGINES
+@FRICTIONS
+def test_a_box_pressed_on_the_floor_feels_stiffness_times_depth(engine, friction_law):
+    scene = make_scene(height=0.01)
+    result = step(scene, vector(0, 0.1, 0), vector(0, 0.02, 0), engine, friction=friction_law)
+    assert_near(result.pose, 0, 0.06, 0)
+    assert_near(result.wrench, 0, 4.0, 0, atol=1e-7)
+    assert result.mode.tolist() == [ContactMode.STICK, ContactMode.FREE]
+
+
+@ENGINES
+@FRICTIONS
+def test_a_box_pressed_on_the_wall_feels_stiffness_times_depth(engine, friction_law):
+    scene = make_scene(position=0.1)
+    result = step(scene, vector(0, 0.1, 0), vector(0.09, 0.1, 0), engine, friction=friction_law)
+    assert_near(result.pose, 0.07, 0.1, 0)
+    assert_near(result.wrench, -2.0, 0, 0, atol=1e-7)
+    assert result.mode.tolist() == [ContactMode.FREE, ContactMode.STICK]
+
+
+@ENGINES
+@SIDES
+@pytest.mark.parametrize("mu", [0.1, 0.4, 0.9])
+def test_a_sliding_slab_feels_friction_times_the_normal_force_against_its_motion(engine, mu, side):
+    scene = make_scene(SLAB, friction=mu)
+    result = step(scene, vector(0, 0.02, 0), vector(0.06 * side, -0.03, 0), engine)
+    assert_near(result.wrench, -side * mu * 5.0, 5.0, 0, atol=1e-7)
+    assert_near(result.pose, side * (0.06 - mu * 5.0 / 100), 0.02, 0)
+    slip = ContactMode.SLIP_POSITIVE if side > 0 else ContactMode.SLIP_NEGATIVE
+    assert result.mode.tolist() == [slip, ContactMode.FREE]
+
+
+@ENGINES
+@SIDES
+def test_along_the_wall_friction_opposes_the_slip_too(engine, side):
+    scene = make_scene(SLAB.flip(-1).flip(0), friction=0.3, position=0.02)
+    result = step(scene, vector(0, 0.5, 0), vector(0.04, 0.5 + 0.05 * side, 0), engine)
+    assert_near(result.wrench, -4.0, -side * 0.3 * 4.0, 0, atol=1e-7)
+    slip = ContactMode.SLIP_POSITIVE if side > 0 else ContactMode.SLIP_NEGATIVE
+    assert result.mode.tolist() == [ContactMode.FREE, slip]
+
+
+@ENGINES
+@FRICTIONS
+@SIDES
+def test_a_command_within_the_friction_cone_moves_nothing(engine, friction_law, side):
+    command = vector(0.015 * side, 0, 0)
+    result = step(make_scene(), vector(0, 0.05, 0), command, engine, friction=friction_law)
+    # The tangential force at the foot turns the box only where its torque tips it.
+    assert_near(result.pose, 0, 0.05, 0)
+    assert_near(result.wrench, -1.5 * side, 5.0, 0, atol=1e-7)
+    assert int(result.mode[0]) == ContactMode.STICK
+
+
+@ENGINES
+def test_without_friction_the_tangential_force_vanishes(engine):
+    scene = make_scene(SLAB, friction=0.0)
+    result = step(scene, vector(0, 0.02, 0), vector(0.05, -0.01, 0), engine)
+    assert_near(result.pose, 0.05, 0.02, 0)
+    assert_near(result.wrench, 0, 3.0, 0, atol=1e-7)
+
+
+@ENGINES
+@FRICTIONS
+def test_a_point_contact_gives_the_torque_of_its_lever(engine, friction_law):
+    wedge = vector([0.04, -0.05], [0.05, 0.05], [-0.05, 0.05])
+    scene = make_scene(wedge, friction=0.5)
+    result = step(scene, vector(0, 0.06, 0), vector(0, 0.01, 0), engine, friction=friction_law)
+    arm = rotate(result.pose[2], wedge[0])
+    force = result.wrench[:2]
+    assert abs(float(result.pose[1] + arm[1])) < CLOSE
+    torque = arm[0] * force[1] - arm[1] * force[0]
+    assert abs(float(result.wrench[2] - torque)) < 1e-7
+    assert float(result.wrench[2]) > 0.05
+
+
+@ENGINES
+@SIDES
+def test_a_torque_beyond_half_the_width_times_the_load_tips_the_box(engine, side):
+    load, width = 4.0, 0.03
+    flat = step(
+        make_scene(friction=0.0),
+        vector(0, 0.05, 0),
+        vector(0, 0.05 - load / 100, side * 0.99 * load * width / 50),
+        engine,
+    )
+    assert_near(flat.pose, 0, 0.05, 0)
+    tipped = step(
+        make_scene(friction=0.0),
+        vector(0, 0.05, 0),
+        vector(0, 0.05 - load / 100, side * 2.0 * load * width / 50),
+        engine,
+    )
+    assert side * float(tipped.pose[2]) > 1e-3
+    corner = transform_points(tipped.pose, BOX)
+    assert abs(float(corner[:, 1].min())) < CLOSE
+
+
+# Floor and wall
+
+
+@ENGINES
+def test_in_the_corner_each_terrain_bears_its_own_axis(engine):
+    scene = make_scene(friction=0.0, position=0.05)
+    result = step(scene, vector(0, 0.06, 0), vector(0.05, 0.02, 0), engine)
+    assert_near(result.pose, 0.02, 0.05, 0)
+    assert_near(result.wrench, -3.0, 3.0, 0, atol=1e-7)
+    assert ContactMode.FREE not in result.mode.tolist()
+
+
+@ENGINES
+@pytest.mark.parametrize("mu", [1.2, 1.5])
+def test_a_box_jammed_between_floor_and_wall_is_answered_without_friction(engine, mu):
+    scene = make_scene(friction=mu, position=0.025)
+    arguments = (vector(0, 0.045, 0), vector(0.01, 0.02, 0), STIFFNESS, StepSettings())
+    result = simulate_step(scene, *arguments, engine)
+    free = simulate_step(make_scene(friction=0.0, position=0.025), *arguments, engine)
+    assert int(result.status) == StepStatus.RELAXED
+    torch.testing.assert_close(result.pose, free.pose, atol=1e-8, rtol=0)
+    assert_near(result.pose, -0.005, 0.05, 0, atol=1e-8)
+
+
+@ENGINES
+def test_a_corridor_too_low_for_the_object_is_answered_near_it_and_flagged(engine):
+    """Regression: floor and ceiling closer than the box once recursed without end."""
+    one = torch.ones((), dtype=torch.float64)
+    scene = ContactScene(
+        BOX, (floor(0 * one), HalfPlane(vector(0, -1), -0.09 * one)), vector(0.4, 0.4)
+    )
+    result = simulate_step(
+        scene, vector(0, 0.045, 0), vector(0, 0.02, 0), STIFFNESS, StepSettings(), engine
+    )
+    assert int(result.status) == StepStatus.RELAXED
+    assert torch.isfinite(result.wrench).all()
+    # Turning does not help, so it yields to both sides and stays within the overlap.
+    world = transform_points(result.pose, BOX)[:, 1]
+    assert float(world.min()) > -0.011 and float(world.max()) < 0.101
+
+
+@ENGINES
+@FRICTIONS
+def test_jammed_answers_are_finite_near_and_without_friction(engine, friction_law):
+    points = outline_points("mug")
+    scene, start, command = random_transitions(points, 60, seed=3)
+    inside = torch.stack((scene_wall(scene), scene_floor(scene), 0 * start[:, 2]), dim=-1)
+    lowest = transform_points(start * vector(0, 0, 1), scene.points_ee)
+    start = torch.cat(
+        (
+            (inside[:, 0] - lowest[..., 0].amax(-1) + 0.002)[:, None],
+            (inside[:, 1] - lowest[..., 1].amin(-1) - 0.002)[:, None],
+            start[:, 2:],
+        ),
+        dim=-1,
+    )
+    scene = ContactScene(scene.points_ee, scene.terrains, torch.full_like(scene.friction, 2.0))
+    result = simulate_step(
+        scene, start, command, STIFFNESS, StepSettings(friction=friction_law, substeps=1), engine
+    )
+    relaxed = result.status == StepStatus.RELAXED
+    assert int(relaxed.sum()) > 10
+    free = simulate_step(
+        ContactScene(scene.points_ee, scene.terrains, 0 * scene.friction),
+        start,
+        command,
+        STIFFNESS,
+        StepSettings(friction=friction_law, substeps=1),
+        engine,
+    )
+    torch.testing.assert_close(result.pose[relaxed], free.pose[relaxed], atol=1e-7, rtol=0)
+    assert float((result.pose - start)[relaxed, :2].abs().max()) < 0.1
+
+
+def test_a_wall_on_a_slope_holds_the_box_at_its_normal():
+    """Terrains are any half-planes: here a floor that leans by 0.2 rad."""
+    normal = vector(-math.sin(0.2), math.cos(0.2))
+    scene = ContactScene(
+        rotated(SLAB, 0.2),
+        (HalfPlane(normal, vector(0.0)[0]), wall(vector(9.0)[0])),
+        vector(0.0, 0.0),
+    )
+    start = torch.cat((0.02 * normal, vector(0)))
+    command = torch.cat((-0.02 * normal, vector(0)))
+    for engine in ("torch", "native"):
+        result = step(scene, start, command, engine)
+        torch.testing.assert_close(result.wrench[:2], 4.0 * normal, atol=1e-7, rtol=0)

@@ -1,0 +1,94 @@
+"""Friction laws, substeps and compliance of the step, for both engines."""
+
+from __future__ import annotations
+
+import pytest
+from contact_scenes import (
+    SLAB,
+    STIFFNESS,
+    make_scene,
+    outline_points,
+    random_transitions,
+    vector,
+)
+from simulator_steps import CLOSE, ENGINES, SIDES, assert_near, step
+
+from tpcd.simulator import StepSettings, simulate_step
+
+
+@ENGINES
+@SIDES
+def test_convex_friction_lifts_a_sliding_body_by_friction_times_slip(engine, side):
+    mu, press, pull = 0.4, 0.03, 0.06
+    scene = make_scene(SLAB, friction=mu)
+    start, command = vector(0, 0.02, 0), vector(pull * side, 0.02 - press, 0)
+    result = step(scene, start, command, engine, friction="anitescu")
+    # Minimise (slip - pull)^2 + (lift + press)^2 on lift = mu slip.
+    slip = (pull - mu * press) / (1 + mu**2)
+    assert_near(result.pose, slip * side, 0.02 + mu * slip, 0)
+    real = step(scene, start, command, engine, friction="coulomb")
+    assert abs(float(real.pose[1]) - 0.02) < CLOSE
+
+
+@ENGINES
+def test_with_more_substeps_the_lift_of_convex_friction_goes_to_zero(engine):
+    scene = make_scene(SLAB, friction=0.4)
+    start, command = vector(0, 0.02, 0), vector(0.06, -0.01, 0)
+    exact = step(scene, start, command, engine)
+    errors = [
+        float((step(scene, start, command, engine, friction="anitescu", substeps=n).pose
+               - exact.pose).abs().max())
+        for n in (1, 4, 16)
+    ]  # fmt: skip
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < errors[0] / 8
+
+
+@ENGINES
+def test_more_substeps_converge_to_the_path_of_friction(engine):
+    scene, start, command = random_transitions(outline_points("egg"), 30, seed=41)
+    poses = {
+        n: simulate_step(
+            scene, start, command, STIFFNESS, StepSettings(substeps=n, follow_path=True), engine
+        ).pose
+        for n in (1, 8, 32)
+    }
+    coarse, fine = ((poses[n] - poses[32]).abs().mean() for n in (1, 8))
+    assert float(fine) < 0.35 * float(coarse)
+
+
+@ENGINES
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize("compliance", [1e-5, 1e-3, 5e-2])
+def test_a_soft_floor_is_a_spring_in_series_with_the_arm(engine, friction, compliance):
+    """Also for the two loaded corners of a face: the terrain yields to their sum."""
+    scene = make_scene(friction=friction)
+    result = step(
+        scene,
+        vector(0, 0.05, 0),
+        vector(0, 0.01, 0),
+        engine,
+        compliance=compliance,
+        rounds=100,
+    )
+    force = 0.04 / (1 / 100 + compliance)
+    assert_near(result.wrench, 0, force, 0, atol=1e-5)
+    assert_near(result.pose, 0, 0.05 - compliance * force, 0, atol=1e-7)
+
+
+@ENGINES
+def test_three_loaded_rows_on_soft_terrain_balance_springs_in_series(engine):
+    """Face on the floor and edge at the wall: each terrain yields to its own load."""
+    compliance = 2e-3
+    scene = make_scene(friction=0.0, position=0.05)
+    result = step(
+        scene,
+        vector(0.02, 0.05, 0),
+        vector(0.05, 0.02, 0),
+        engine,
+        compliance=compliance,
+        rounds=100,
+    )
+    force = 0.03 / (1 / 100 + compliance)
+    assert_near(result.wrench, -force, force, 0, atol=1e-5)
+    assert_near(result.pose, 0.02 + compliance * force, 0.05 - compliance * force, 0, atol=1e-7)

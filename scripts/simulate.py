@@ -24,11 +24,15 @@ SCENE_STREAM, EPISODE_STREAM = 0, 1
 TOUCHING = 2e-4
 """Clearance under which the summary counts a step as touching [m]."""
 
-METRES = ("mount_x", "mount_z", "floor_height", "wall_position", "noise_position")
-METRES += ("start x", "start z")
-RADIANS = ("mount_phi", "noise_angle", "start phi")
-LARGEST_LENGTH = 5.0
-"""Lengths beyond this [m] are taken for millimetres, as in episodes."""
+METRES, RADIANS = (5.0, "m", "millimetres"), (2 * math.pi, "rad", "degrees")
+LIMITS = {
+    **dict.fromkeys(("mount_x", "mount_z", "floor_height", "wall_position"), METRES),
+    **dict.fromkeys(("start x", "start z"), METRES),
+    **dict.fromkeys(("mount_phi", "start phi"), RADIANS),
+    "noise_position": (0.05, "m", "millimetres"),
+    "noise_angle": (0.5, "rad", "degrees"),
+}
+"""Sizes beyond which a value was meant in another unit, as in episodes."""
 FILE_ENDINGS = (".csv", ".parquet", ".yaml", ".truth.csv", ".truth.yaml")
 """Of the files that an episode here can have."""
 
@@ -93,14 +97,19 @@ class Simulation:
             least={"steps": 1, "episodes": 1, "friction": 0.0, **dict.fromkeys(noise, 0.0)},
             above={"stiffness": 0.0, "scale": 0.0},
         )
-        start = dict(zip(("start x", "start z", "start phi"), self.start, strict=False))
-        for name, value in {**vars(self), **start}.items():
-            if name in METRES and value is not None and abs(value) > LARGEST_LENGTH:
-                raise ValueError(f"{name} is {value:g}, expected m; it looks like millimetres")
-            if name in RADIANS and value is not None and abs(value) > 2 * math.pi:
-                raise ValueError(f"{name} is {value:g}, expected rad; it looks like degrees")
+        for name, (largest, unit, likely) in LIMITS.items():
+            value = self._value(name)
+            if value is not None and abs(value) > largest:
+                raise ValueError(f"{name} is {value:g}, expected {unit}; it looks like {likely}")
         if self.name is not None and (not self.name or Path(self.name).name != self.name):
             raise ValueError(f"name is {self.name!r}, expected a file name without a folder")
+
+    def _value(self, name: str) -> float | None:
+        """A field, or the entry `start x`, `start z` or `start phi` of the start pose."""
+        if not name.startswith("start "):
+            return getattr(self, name)
+        place = ("start x", "start z", "start phi").index(name)
+        return self.start[place] if place < len(self.start) else None
 
 
 def simulate(config: Simulation) -> None:

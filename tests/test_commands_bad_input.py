@@ -182,6 +182,8 @@ SIMULATE = {
     "outline in millimetres": ({"--outline": "mm.csv"}, "looks like millimetres"),
     "no steps": ({"--steps": "-3"}, "steps is -3, expected at least 1"),
     "negative noise": ({"--noise-force": "-1"}, "noise_force is -1, expected at least 0"),
+    "noise in millimetres": ({"--noise-position": "0.2"}, "looks like millimetres"),
+    "not finite": ({"--friction": "nan"}, "friction: found 'nan', expected a finite number;"),
     "no stiffness": ({"--stiffness": "100 0 50"}, "stiffness is 0, expected more than 0"),
     "angle in degrees": ({"--mount-phi": "90"}, "mount_phi is 90, expected rad"),
     "start in degrees": ({"--start": "0 0.3 45"}, "start phi is 45, expected rad"),

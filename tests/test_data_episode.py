@@ -52,7 +52,8 @@ def episodes(draw) -> Episode:
         wrenches=torch.tensor(wrenches, dtype=torch.float64),
         stiffness=torch.tensor(draw(st.tuples(positive, positive, positive)), dtype=torch.float64),
         sensor_std=torch.tensor(
-            draw(st.tuples(*[st.floats(0, 10)] * 6)), dtype=torch.float64
+            draw(st.tuples(*[st.floats(0, largest) for largest in (0.05, 0.05, 0.5, 9, 9, 9)])),
+            dtype=torch.float64,
         ),
         object=draw(st.none() | text),
         notes=draw(st.none() | text),
@@ -180,6 +181,8 @@ BAD_HEADERS = {
     "text": (YAML.replace("100, 100", "100, stiff"), ["stiffness", "'stiff'", "finite number"]),
     "negative noise": (YAML.replace("0.02]", "-0.02]"), ["sensor_std of tau is -0.02", ">= 0"]),
     "short noise": (YAML.replace(", 0.02]", "]"), ["sensor_std: found 5 entries", "F_z, tau]"]),
+    "noise in mm": (YAML.replace("[2e-4", "[0.2"), ["sensor_std of x is 0.2", "like mm"]),
+    "noise in degrees": (YAML.replace("0.0005", "0.6"), ["of phi is 0.6", "like degrees"]),
     "time step": (YAML + "time_step_s: 0\n", ["time_step_s is 0", "> 0"]),
     "unknown prior": (YAML + "priors: {frictoin: [0, 1]}", ["'frictoin'", "'friction'?"]),
     "reversed prior": (YAML + "priors: {friction: [0.9, 0.1]}", ["[0.9, 0.1]", "low < high"]),

@@ -299,7 +299,7 @@ def test_both_truths_answer_the_same_first_steps_alike(simulate_command, tmp_pat
         (("--outline", "mug", "--steps", "0"), "steps is 0"),
         (("--outline", "mug", "--start", "0", "0", "0"), "inside the floor"),
         (("--outline", "mug", "--start", "0", "0"), "expected x, z, phi"),
-        (("--outline", "mug", "--noise-force", "-1"), "sensor_std"),
+        (("--outline", "mug", "--noise-force", "-1"), "noise_force is -1"),
     ],
 )
 def test_a_bad_request_gets_one_line_and_leaves_nothing(

@@ -19,6 +19,7 @@ REMEDIES = {
     errno.EACCES: "choose a place where you may read and write",
     errno.EPERM: "choose a place where you may read and write",
     errno.EROFS: "choose a place where you may write",
+    errno.ENOENT: "check the path",
     errno.ENOSPC: "free some space",
     errno.ENOTDIR: "a file stands where a folder is needed",
     errno.ENAMETOOLONG: "choose a shorter name",
@@ -80,7 +81,8 @@ def _wrong_value(problem: str) -> str:
     if literal := re.search(r"Literal\[(.*?)\]", problem):
         expected = f"one of {literal[1]}"
     else:
-        kinds: dict[str, None] = dict.fromkeys(re.findall(r"<class '(\w+)'>", problem))
+        named = re.findall(r"Expected an? <class '(\w+)'>", problem)
+        kinds: dict[str, None] = dict.fromkeys(named)
         kinds.pop("NoneType", None)
         expected = " or ".join(KINDS.get(kind, kind) for kind in kinds) or "another value"
     return f"found {value[1]!r}, expected {expected}"

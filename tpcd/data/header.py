@@ -28,6 +28,8 @@ ESTIMATE_NOISE = (
 )
 LARGEST_LENGTH = 5.0
 """Lengths beyond this [m] are taken for millimetres."""
+LARGEST_NOISE = {"x": (0.05, "m", "mm"), "z": (0.05, "m", "mm"), "phi": (0.5, "rad", "degrees")}
+"""Noise of poses beyond this [m, rad] is taken for millimetres or degrees."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,14 @@ def parse_header(content: Any, path: Path) -> Header:
         if value < 0:
             raise EpisodeError(
                 path, f"sensor_std of {name} is {value:g}, expected >= 0", ESTIMATE_NOISE
+            )
+        largest, unit, likely = LARGEST_NOISE.get(name, (math.inf, "", ""))
+        if value > largest:
+            raise EpisodeError(
+                path,
+                f"sensor_std of {name} is {value:g}, expected {unit} (at most {largest:g}); it"
+                f" looks like {likely}",
+                f"give it in {unit}",
             )
     time_step = content.get("time_step_s")
     if time_step is not None:

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
     import torch
@@ -64,8 +64,7 @@ class Calibration:
     """Run r takes seed + r."""
 
     def __post_init__(self) -> None:
-        if self.runs < 1 or self.steps < 1:
-            raise ValueError(f"runs {self.runs} and steps {self.steps} must be at least 1")
+        check_numbers(self, least={"runs": 1, "steps": 1, "particles": 0})
 
 
 def calibrate(config: Calibration) -> None:
@@ -103,7 +102,8 @@ def calibrate(config: Calibration) -> None:
     print(f"{len(places)} runs, {failed} failed; limits hold 95 % of calibrated estimators")
     figure = rank_histograms(places, names)
     with SummaryWriter(str(folder / "tensorboard")) as writer:
-        save_figure(figure, folder, "ranks", writer)
+        save_figure(figure, folder / "figures", "ranks", writer)
+        writer.add_text("table", "```\n" + format_table(table) + "\n```")
         for row in table:
             writer.add_scalar(f"coverage_90/{row['parameter']}", row["inside_90"])
             writer.add_scalar(f"coverage_50/{row['parameter']}", row["inside_50"])

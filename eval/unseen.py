@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tpcd.cli import run
+from tpcd.cli import check_numbers, run
 
 SEEN = (
     "003_cracker_box",
@@ -85,6 +85,10 @@ class Unseen:
     overwrite: bool = False
     """Replace an earlier run in the folder."""
 
+    def __post_init__(self) -> None:
+        counts = ("steps", "test_steps", "tests", "particles")
+        check_numbers(self, least=dict.fromkeys(counts, 1), above={"misfit": 0})
+
 
 def evaluate_unseen(config: Unseen) -> None:
     """Estimate and predict on YCB outlines, half of them unseen, with MuJoCo as truth."""
@@ -133,6 +137,11 @@ def evaluate_unseen(config: Unseen) -> None:
         labels = {"x_mm": "error of x [mm]", "z_mm": "error of z [mm]", "F_z_N": "error of F_z [N]"}
         figure = error_bars(table, labels, group="prior", targets=TARGETS)
         save_figure(figure, folder / "figures", "errors", writer)
+        for row in means:
+            for key, value in row.items():
+                if isinstance(value, float):
+                    label = f"{key}/{row['prior']}/{row['object'].removeprefix('MEAN ')}"
+                    writer.add_scalar(label, value)
         writer.add_text("table", "```\n" + format_table([*table, *means]) + "\n```")
     write_results(folder, [*table, *means], seeds=config.seeds, targets=TARGETS)
     print(f"results in {folder}")

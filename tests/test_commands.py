@@ -47,7 +47,7 @@ def test_a_belief_comes_back_as_it_was_saved(world: Path) -> None:
         assert means[name] == pytest.approx(entry["mean"])
 
 
-def test_the_friction_of_an_unknown_object_is_found(world: Path) -> None:
+def test_the_floor_under_an_unknown_object_is_found(world: Path) -> None:
     import yaml
 
     truth = yaml.safe_load((world / "explore.truth.yaml").read_text())["theta"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -182,6 +183,23 @@ def test_a_folder_without_a_belief_is_refused_in_one_line(tmp_path: Path) -> Non
     (tmp_path / "belief.json").write_text('{"format": "tpcd-belief", "format_version": 99}')
     with pytest.raises(RunError, match="version 99, expected tpcd-belief version 2"):
         load_belief(tmp_path)
+
+
+@pytest.mark.parametrize("spoil", ["a list", "no misfit", "an unknown setting of the step"])
+def test_a_malformed_card_is_refused_in_one_line(learnt, tmp_path: Path, spoil: str) -> None:
+    belief, _, _ = learnt
+    save_belief(belief, tmp_path, "ycb21-z2")
+    path = tmp_path / "belief.json"
+    card = json.loads(path.read_text())
+    if spoil == "a list":
+        card = [card]
+    elif spoil == "no misfit":
+        del card["misfit"]
+    else:
+        card["step"]["gravity"] = 9.81
+    path.write_text(json.dumps(card))
+    with pytest.raises(RunError, match="cannot be read|expected tpcd-belief"):
+        load_belief(tmp_path, belief.prior.shape)
 
 
 def test_a_belief_that_was_cut_off_is_refused_in_one_line(learnt, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-DEGREES_OF_FREEDOM = 8.0
+DEGREES_OF_FREEDOM = 16.0
 _RIDGE = 1e-6
 
 
@@ -41,11 +41,8 @@ class StudentMixture:
     def log_density(self, points: Float[Tensor, "m d"]) -> Float[Tensor, " m"]:
         """Log density of the mixture."""
         d, nu = self.mean.shape[-1], DEGREES_OF_FREEDOM
-        offset = (points[:, None, :] - self.mean).transpose(0, 1)
-        scaled = torch.linalg.solve_triangular(self.factor, offset.mT, upper=False)
-        square = (scaled**2).sum(-2)
+        square, scale = _squares(points, self.mean, self.factor)
         constant = math.lgamma((nu + d) / 2) - math.lgamma(nu / 2) - d / 2 * math.log(nu * math.pi)
-        scale = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         each = constant - scale[:, None] - (nu + d) / 2 * torch.log1p(square / nu)
         return torch.logsumexp(each + self.log_share[:, None], dim=0)
 
@@ -55,9 +52,10 @@ def fit_student_mixture(
     weights: Float[Tensor, " m"],
     components: int,
     generator: torch.Generator,
-    rounds: int = 8,
+    rounds: int = 30,
+    start: StudentMixture | None = None,
 ) -> StudentMixture:
-    """Fit by expectation maximisation of a normal mixture, started at random particles.
+    """Fit by expectation maximisation of a normal mixture, from `start` or random particles.
 
     `weights` sum to 1. Scale matrices are shrunk towards the covariance of all particles
     where a component has few, so that none collapses.
@@ -66,28 +64,41 @@ def fit_student_mixture(
     mean_all = weights @ points
     centred = points - mean_all
     covariance_all = (centred * weights[:, None]).T @ centred
-    covariance_all = covariance_all + _RIDGE * torch.diag(
-        covariance_all.diagonal().clamp_min(1e-12)
-    )
-    start = torch.multinomial(weights, components, replacement=True, generator=generator)
-    mean = points[start]
-    covariance = covariance_all.expand(components, d, d) / components ** (2 / d)
-    share = torch.full((components,), 1 / components, dtype=points.dtype)
+    ridge = _RIDGE * torch.diag(covariance_all.diagonal().clamp_min(1e-12))
+    covariance_all = covariance_all + ridge
+    # Second moments of all components are one product with the squares of the points.
+    squares = (centred[:, :, None] * centred[:, None, :]).flatten(1)
+    if start is None:
+        chosen = torch.multinomial(weights, components, replacement=True, generator=generator)
+        mean = points[chosen]
+        factor = torch.linalg.cholesky(covariance_all).expand(components, d, d)
+        factor = factor / components ** (1 / d)
+        log_share = torch.full((components,), -math.log(components), dtype=points.dtype)
+    else:
+        mean, factor, log_share = start.mean, start.factor, start.log_share
     effective = 1 / (weights**2).sum()
     for _ in range(rounds if components > 1 else 1):
-        factor = torch.linalg.cholesky(covariance)
-        offset = (points[:, None, :] - mean).transpose(0, 1)
-        scaled = torch.linalg.solve_triangular(factor, offset.mT, upper=False)
-        log_density = -0.5 * (scaled**2).sum(-2)
-        log_density = log_density - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[:, None]
-        responsibility = torch.softmax(log_density + share.log()[:, None], dim=0) * weights
+        square, scale = _squares(points, mean, factor)
+        log_density = log_share[:, None] - scale[:, None] - 0.5 * square
+        responsibility = torch.softmax(log_density, dim=0) * weights
         mass = responsibility.sum(-1)
-        mean = (responsibility @ points) / mass.clamp_min(1e-12)[:, None]
-        offset = (points[:, None, :] - mean).transpose(0, 1)
-        scatter = (offset * responsibility[..., None]).mT @ offset
+        share = responsibility / mass.clamp_min(1e-12)[:, None]
+        shift = share @ centred
+        mean = mean_all + shift
+        scatter = (share @ squares).unflatten(1, (d, d)) - shift[:, :, None] * shift[:, None, :]
         # As if each component had seen d + 1 particles from the whole cloud.
         prior = (d + 1) / (effective * mass + d + 1)
-        covariance = (1 - prior)[:, None, None] * scatter / mass.clamp_min(1e-12)[:, None, None]
+        covariance = (1 - prior)[:, None, None] * scatter + ridge
         covariance = covariance + prior[:, None, None] * covariance_all
-        share = mass.clamp_min(1e-6) / mass.clamp_min(1e-6).sum()
-    return StudentMixture(share.log(), mean, torch.linalg.cholesky(covariance))
+        factor = torch.linalg.cholesky(covariance)
+        log_share = (mass.clamp_min(1e-6) / mass.clamp_min(1e-6).sum()).log()
+    return StudentMixture(log_share, mean, factor)
+
+
+def _squares(points: Tensor, mean: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared Mahalanobis distances (k, m) from each component, and log scales (k)."""
+    # Inverting a few small factors is cheaper than solving with each of them for all points.
+    identity = torch.eye(points.shape[-1], dtype=points.dtype)
+    inverse = torch.linalg.solve_triangular(factor, identity.expand_as(factor), upper=False)
+    scaled = inverse @ points.T - inverse @ mean[..., None]
+    return (scaled**2).sum(-2), factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)

@@ -44,13 +44,15 @@ class SamplerSettings:
     """Particles in the cloud."""
     kept_share: float = 0.5
     """Share of the effective sample size that one temperature step keeps."""
-    components: int = 8
+    components: int = 16
     """Components of the fitted mixture."""
-    tempering_moves: int = 4
+    tempering_moves: int = 5
     """Moves of every particle after each temperature but the last."""
     final_moves: int = 8
     """Moves at full likelihood once the datum is in."""
-    independent_share: float = 0.5
+    moves_per_fit: int = 4
+    """The mixture is fitted again to the moved particles after so many moves."""
+    independent_share: float = 0.75
     """Share of moves that are independent draws from the mixture; the rest are local steps."""
 
     def __post_init__(self) -> None:
@@ -60,10 +62,10 @@ class SamplerSettings:
                 f"particles {self.particles} must be >= 16, kept_share {self.kept_share} in "
                 f"(0, 1), components {self.components} >= 1"
             )
-        if min(self.tempering_moves, self.final_moves) < 0:
+        if min(self.tempering_moves, self.final_moves) < 0 or self.moves_per_fit < 1:
             raise ValueError(
                 f"tempering_moves {self.tempering_moves} and final_moves {self.final_moves} "
-                "must be >= 0"
+                f"must be >= 0, moves_per_fit {self.moves_per_fit} >= 1"
             )
         if not 0 <= self.independent_share <= 1:
             raise ValueError(f"independent_share is {self.independent_share}, expected 0 to 1")
@@ -141,6 +143,7 @@ def assimilate(
     state = _State(cloud, *log_likelihood(cloud.positions, None))
     tally = _Tally(evaluations=len(cloud.positions))
     temperature, smallest = 0.0, float(len(cloud.positions))
+    mixture: StudentMixture | None = None
     while temperature < 1.0:
         gain = state.with_datum - state.before
         gain = torch.where(torch.isfinite(gain), gain, -torch.inf)
@@ -149,14 +152,13 @@ def assimilate(
         weights = normalise_log_weights(log_weights)
         smallest = min(smallest, effective_sample_size(weights))
         state = state.weighted(log_weights, weights)
-        mixture, spread = _fit(state.cloud.positions, weights, settings, generator)
+        mixture = _fit(state.cloud.positions, weights, settings, generator, mixture)
         state = state.take(systematic_resample(weights, len(weights), generator))
         temperature += advance
         last = temperature >= 1.0
-        state = _move(
+        state, mixture = _move(
             state,
             mixture,
-            spread,
             temperature,
             last,
             log_prior,
@@ -247,18 +249,22 @@ def _next_temperature(gain: Tensor, temperature: float, kept_share: float) -> fl
 
 
 def _fit(
-    positions: Tensor, weights: Tensor, settings: SamplerSettings, generator: torch.Generator
-) -> tuple[StudentMixture, Tensor]:
-    """Mixture for independent moves and a Cholesky factor of the cloud for local ones."""
-    mixture = fit_student_mixture(positions, weights, settings.components, generator)
-    one = fit_student_mixture(positions, weights, 1, generator)
-    return mixture, one.factor[0]
+    positions: Tensor,
+    weights: Tensor,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+    before: StudentMixture | None,
+) -> StudentMixture:
+    """The mixture of the cloud; from the one before it takes a few rounds only."""
+    rounds = 30 if before is None else 8
+    return fit_student_mixture(
+        positions, weights, settings.components, generator, rounds, start=before
+    )
 
 
 def _move(
     state: _State,
     mixture: StudentMixture,
-    spread: Tensor,
     temperature: float,
     last: bool,
     log_prior: LogDensity,
@@ -266,10 +272,14 @@ def _move(
     settings: SamplerSettings,
     generator: torch.Generator,
     tally: _Tally,
-) -> _State:
+) -> tuple[_State, StudentMixture]:
     """Metropolis-Hastings moves that leave the tempered posterior invariant."""
+    even = torch.full_like(state.before, 1.0 / len(state.before))
+    spread = torch.linalg.cholesky(_covariance(state.cloud.positions))
     share_independent = settings.independent_share
     for move in range(settings.final_moves if last else settings.tempering_moves):
+        if move > 0 and move % settings.moves_per_fit == 0:
+            mixture = _fit(state.cloud.positions, even, settings, generator, mixture)
         # Independent moves come due at their share of all moves so far, the first one first.
         due = math.ceil((move + 1) * share_independent) - math.ceil(move * share_independent)
         independent = due > 0
@@ -305,7 +315,13 @@ def _move(
             torch.where(accepted, with_datum, state.with_datum),
         )
         tally.count("independent" if independent else "local", len(here), int(accepted.sum()))
-    return state
+    return state, mixture
+
+
+def _covariance(positions: Tensor) -> Tensor:
+    """Covariance of the cloud, kept away from singular."""
+    covariance = torch.cov(positions.T)
+    return covariance + 1e-6 * torch.diag(covariance.diagonal().clamp_min(1e-12))
 
 
 def _evidence_std(ancestor: Tensor) -> float:

@@ -59,7 +59,8 @@ def load_state(folder: Path, episode: Episode) -> EstimatorState | None:
     try:
         with safe_open(path, framework="pt") as file:
             card = file.metadata()
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            # Cloned, since products of matrices round by how their memory is aligned.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
         index, of = int(card["index"]), card["episode"]
         generator = tensors.pop("generator")
     except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:

@@ -67,15 +67,25 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     if not path.is_file():
         raise RunError(path, "no such file", "give the folder that estimate wrote")
     card = read_json(path)
-    if card.get("format") != "tpcd-belief" or card.get("format_version") != FORMAT_VERSION:
-        found = f"{card.get('format')} version {card.get('format_version')}"
-        raise RunError(path, f"holds {found}, expected tpcd-belief version {FORMAT_VERSION}")
+    found = card if isinstance(card, dict) else {}
+    if found.get("format") != "tpcd-belief" or found.get("format_version") != FORMAT_VERSION:
+        text = f"{found.get('format')} version {found.get('format_version')}"
+        raise RunError(path, f"holds {text}, expected tpcd-belief version {FORMAT_VERSION}")
+    try:
+        prior, weights = card["prior"], card["prior_sha256"]
+        misfit, step = MisfitField(**card["misfit"]), StepSettings(**card["step"])
+        # JSON has no NaN: the filter `paper` estimates no evidence.
+        evidence = {
+            name: math.nan if card[name] is None else float(card[name])
+            for name in ("log_evidence", "log_evidence_std")
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(path, f"cannot be read ({error!r})", "estimate again") from error
     if shape is None:
-        if prior_hash(card["prior"]) != card["prior_sha256"]:
-            raise RunError(
-                path, f"was made with other weights of the prior {card['prior']}", "estimate again"
-            )
-        shape = load_prior(card["prior"])
+        if prior_hash(prior) != weights:
+            fault = f"was made with other weights of the prior {prior}"
+            raise RunError(path, fault, "estimate again")
+        shape = load_prior(prior)
     data = Path(folder) / "belief.safetensors"
     try:
         tensors = load_tensors(data.read_bytes())
@@ -86,11 +96,9 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         raise RunError(data, f"cannot be read ({error})", "estimate again") from error
     return Belief(
         prior=ParameterPrior(shape, values.pop("low"), values.pop("high")),
-        misfit=MisfitField(**card["misfit"]),
-        step=StepSettings(**card["step"]),
-        # JSON has no NaN: the filter `paper` estimates no evidence.
-        log_evidence=math.nan if card["log_evidence"] is None else card["log_evidence"],
-        log_evidence_std=math.nan if card["log_evidence_std"] is None else card["log_evidence_std"],
+        misfit=misfit,
+        step=step,
+        **evidence,
         **values,
     )
 

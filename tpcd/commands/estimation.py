@@ -65,6 +65,7 @@ def run_estimation(
         (folder / STEPS_FILE).open("a", encoding="utf-8") as lines,
         tqdm(total=len(episode) - 1, initial=done, unit="step", disable=not show_progress) as bar,
     ):
+        bar.set_postfix_str("the first step also compiles, once on a machine")
         for step in steps:
             learnt = _learnt_most(belief, step.belief)
             belief = step.belief
@@ -97,12 +98,12 @@ def _earlier_rows(path: Path, done: int) -> list[dict[str, Any]]:
 
 def summarise(belief: Belief) -> dict[str, Any]:
     """Mean, 90 % interval, unit and whether it is still the prior, for each parameter."""
-    prior = prior_interval(belief)
+    _, prior_low, prior_high = prior_summary(belief)
     low, high = belief.quantile(0.05), belief.quantile(0.95)
     mean, std = belief.mean(), belief.std()
     entries = {}
     for i, (name, unit) in enumerate(zip(belief.prior.names, belief.prior.units, strict=True)):
-        width = float(high[i] - low[i]) / float(prior[1][i] - prior[0][i])
+        width = float(high[i] - low[i]) / float(prior_high[i] - prior_low[i])
         entries[name] = {
             "mean": float(mean[i]),
             "std": float(std[i]),
@@ -126,20 +127,20 @@ def summarise(belief: Belief) -> dict[str, Any]:
     }
 
 
-def prior_interval(belief: Belief) -> tuple[Tensor, Tensor]:
-    """The 90 % interval of every entry of theta before any datum."""
+def prior_summary(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and ends of the 90 % interval of every entry of theta before any datum."""
     prior = belief.prior
     draws = prior.to_vector(prior.sample(4000, torch.Generator().manual_seed(0)))
     levels = torch.tensor([0.05, 0.95], dtype=torch.float64)
     low, high = torch.quantile(draws, levels, dim=0)
-    return low, high
+    return draws.mean(0), low, high
 
 
 def _learnt_most(before: Belief | None, now: Belief) -> str:
     """The parameter whose spread shrank most in this step."""
     names, std = now.prior.names, now.std()
     if before is None:
-        low, high = prior_interval(now)
+        _, low, high = prior_summary(now)
         reference = (high - low) / 3.29
     else:
         reference = before.std()
@@ -182,13 +183,13 @@ def _draw(
     z = belief.prior.shape.latent_dim
     names, units = belief.prior.names[z:], belief.prior.units[z:]
     columns = {
-        key: torch.tensor([row[key] for row in history])[:, z:].numpy()
-        for key in ("mean", "low", "high")
+        key: torch.cat((before[None], torch.tensor([row[key] for row in history])))[:, z:].numpy()
+        for key, before in zip(("mean", "low", "high"), prior_summary(belief), strict=True)
     }
     known = None if truth is None else torch.tensor([truth.scene[name] for name in names]).numpy()
     last = len(history)
     figure = estimation_progress(
-        torch.arange(1, last + 1).numpy(), **columns, names=names, units=units, truth=known
+        torch.arange(last + 1).numpy(), **columns, names=names, units=units, truth=known
     )
     save_figure(figure, folder, "estimation", writer, last)
     chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()

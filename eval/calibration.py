@@ -138,7 +138,8 @@ def draw_episode(
     misfit_sd = field.sd_of(normal(1))[0]
     parameters = prior.to_parameters(score[0])
     outline = prior.shape.boundary_points(parameters.latent)
-    theta = dict(zip(SCENE_NAMES, vector[prior.shape.latent_dim :].tolist(), strict=True))
+    entries = vector[prior.shape.latent_dim :].tolist()
+    theta: dict[str, float] = dict(zip(SCENE_NAMES, entries, strict=True))
     start = draw_scene("drawn", outline.numpy(), generator, fixed=theta)
     scene, stiffness = scene_from_parameters(prior.shape, parameters), start.stiffness
     coefficients = misfit_sd * normal(field.bumps * len(scene.terrains))

@@ -159,8 +159,8 @@ def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
 
 
 def weighted_quantile(
-    values: Float[Tensor, "m *d"], weights: Float[Tensor, " m"], level: float
-) -> Float[Tensor, "*d"]:
+    values: Float[Tensor, " m *columns"], weights: Float[Tensor, " m"], level: float
+) -> Float[Tensor, "*columns"]:
     """Smallest value of each column at which the weights sum up to the level."""
     ordered, order = values.sort(dim=0)
     cumulative = weights[order].cumsum(0)

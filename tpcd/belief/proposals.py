@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-DEGREES_OF_FREEDOM = 16.0
+DEGREES_OF_FREEDOM = 16
 _RIDGE = 1e-6
 
 
@@ -33,8 +33,8 @@ class StudentMixture:
             self.log_share.exp(), count, replacement=True, generator=generator
         )
         normal = torch.randn(count, d, generator=generator, dtype=self.mean.dtype)
-        half = torch.full((count,), DEGREES_OF_FREEDOM / 2, dtype=self.mean.dtype)
-        chi_square = 2 * torch._standard_gamma(half, generator=generator)
+        squares = torch.randn(count, DEGREES_OF_FREEDOM, generator=generator, dtype=normal.dtype)
+        chi_square = (squares**2).sum(-1)
         scaled = normal * (DEGREES_OF_FREEDOM / chi_square).sqrt()[:, None]
         return self.mean[component] + (self.factor[component] @ scaled[..., None])[..., 0]
 

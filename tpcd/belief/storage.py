@@ -98,7 +98,8 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         prior=ParameterPrior(shape, values.pop("low"), values.pop("high")),
         misfit=misfit,
         step=step,
-        **evidence,
+        log_evidence=evidence["log_evidence"],
+        log_evidence_std=evidence["log_evidence_std"],
         **values,
     )
 

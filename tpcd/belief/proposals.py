@@ -15,6 +15,8 @@ from torch import Tensor
 
 DEGREES_OF_FREEDOM = 16
 _RIDGE = 1e-6
+_LEAST_SHARE = 10.0
+"""A component counts as empty below the even share divided by this."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ def fit_student_mixture(
 ) -> StudentMixture:
     """Fit by expectation maximisation of a normal mixture, from `start` or random particles.
 
+    `start` must have as many components.
+
     `weights` sum to 1. Scale matrices are shrunk towards the covariance of all particles
     where a component has few, so that none collapses.
     """
@@ -68,14 +72,16 @@ def fit_student_mixture(
     covariance_all = covariance_all + ridge
     # Second moments of all components are one product with the squares of the points.
     squares = (centred[:, :, None] * centred[:, None, :]).flatten(1)
-    if start is None:
-        chosen = torch.multinomial(weights, components, replacement=True, generator=generator)
-        mean = points[chosen]
-        factor = torch.linalg.cholesky(covariance_all).expand(components, d, d)
-        factor = factor / components ** (1 / d)
-        log_share = torch.full((components,), -math.log(components), dtype=points.dtype)
-    else:
-        mean, factor, log_share = start.mean, start.factor, start.log_share
+    chosen = torch.multinomial(weights, components, replacement=True, generator=generator)
+    mean = points[chosen]
+    factor = torch.linalg.cholesky(covariance_all).expand(components, d, d) / components ** (1 / d)
+    log_share = torch.full((components,), -math.log(components), dtype=points.dtype)
+    if start is not None:
+        # A component that has lost its particles starts afresh.
+        alive = start.log_share > log_share - math.log(_LEAST_SHARE)
+        mean = torch.where(alive[:, None], start.mean, mean)
+        factor = torch.where(alive[:, None, None], start.factor, factor)
+        log_share = torch.log_softmax(torch.where(alive, start.log_share, log_share), dim=0)
     effective = 1 / (weights**2).sum()
     for _ in range(rounds if components > 1 else 1):
         square, scale = _squares(points, mean, factor)

@@ -36,6 +36,9 @@ LogLikelihood = Callable[[Tensor, Threshold | None], tuple[Tensor, Tensor]]
 particle that stays below its threshold may get -inf for both."""
 
 
+_MIXTURE = "mixture."
+
+
 @dataclass(frozen=True)
 class SamplerSettings:
     """Budget and shape of the sampler."""
@@ -44,7 +47,7 @@ class SamplerSettings:
     """Particles in the cloud."""
     kept_share: float = 0.5
     """Share of the effective sample size that one temperature step keeps."""
-    components: int = 16
+    components: int = 8
     """Components of the fitted mixture."""
     tempering_moves: int = 5
     """Moves of every particle after each temperature but the last."""
@@ -85,6 +88,8 @@ class Cloud:
     """Standard error of the log evidence."""
     step_scale: float
     """Scale of the local moves, adapted to an acceptance near 1/4."""
+    mixture: StudentMixture | None = None
+    """The mixture last fitted to the particles, from which the next fit starts."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +123,21 @@ def start_cloud(positions: Float[Tensor, "m d"], log_prior: LogDensity) -> Cloud
 
 def cloud_to_tensors(cloud: Cloud) -> dict[str, Tensor]:
     """The fields of a cloud as tensors, to be stored."""
+    fields = {name: value for name, value in vars(cloud).items() if name != "mixture"}
+    if cloud.mixture is not None:
+        fields |= {_MIXTURE + name: value for name, value in vars(cloud.mixture).items()}
     return {
         name: value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
-        for name, value in vars(cloud).items()
+        for name, value in fields.items()
     }
 
 
 def cloud_from_tensors(tensors: dict[str, Tensor]) -> Cloud:
     """The cloud that `cloud_to_tensors` made tensors of."""
-    return Cloud(**{n: float(v) if v.ndim == 0 else v for n, v in tensors.items()})  # type: ignore[arg-type]
+    fields = {n: float(v) if v.ndim == 0 else v for n, v in tensors.items()}
+    mixture = {n: fields.pop(n) for n in tuple(fields) if n.startswith(_MIXTURE)}
+    parts = {name.removeprefix(_MIXTURE): value for name, value in mixture.items()}
+    return Cloud(**fields, mixture=StudentMixture(**parts) if parts else None)  # type: ignore[arg-type]
 
 
 def assimilate(
@@ -143,7 +154,7 @@ def assimilate(
     state = _State(cloud, *log_likelihood(cloud.positions, None))
     tally = _Tally(evaluations=len(cloud.positions))
     temperature, smallest = 0.0, float(len(cloud.positions))
-    mixture: StudentMixture | None = None
+    mixture = cloud.mixture
     while temperature < 1.0:
         gain = state.with_datum - state.before
         gain = torch.where(torch.isfinite(gain), gain, -torch.inf)
@@ -168,7 +179,7 @@ def assimilate(
             tally,
         )
         tally.temperatures += 1
-    cloud = replace(state.cloud, log_likelihood=state.with_datum)
+    cloud = replace(state.cloud, log_likelihood=state.with_datum, mixture=mixture)
     cloud = replace(cloud, log_evidence_std=_evidence_std(cloud.ancestor))
     info = CloudInfo(
         temperatures=tally.temperatures,
@@ -256,7 +267,7 @@ def _fit(
     before: StudentMixture | None,
 ) -> StudentMixture:
     """The mixture of the cloud; from the one before it takes a few rounds only."""
-    rounds = 30 if before is None else 8
+    rounds = 30 if before is None else 6
     return fit_student_mixture(
         positions, weights, settings.components, generator, rounds, start=before
     )

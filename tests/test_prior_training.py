@@ -10,13 +10,14 @@ import pytest
 import torch
 import yaml
 
+from tpcd.cli import run as run_command
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from training.config import DataConfig, OptimConfig, TrainingConfig
 from training.evaluate import outline_errors
 from training.outlines import data_hash, mirrored, suitable, training_outlines
 from training.rates import cosine_rate, split_optimizers
-from training.train import main
+from training.train import Training, train_prior
 
 CONFIGS = Path(__file__).resolve().parents[1] / "training" / "configs"
 NAMES = ("drink_can", "banana", "juice_carton")
@@ -42,10 +43,17 @@ ARGUMENTS = [
 ]
 
 
+def call(*arguments: str) -> int:
+    """Train by the command; its exit code."""
+    with pytest.raises(SystemExit) as stopped:
+        run_command(train_prior, Training, list(arguments), prog="train")
+    return int(stopped.value.code or 0)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run")
-    assert main([*ARGUMENTS, "--optim.steps=210", f"--out={out}"]) == 0
+    assert call(*ARGUMENTS, "--optim.steps=210", f"--out={out}") == 0
     return out
 
 
@@ -87,14 +95,14 @@ def test_a_run_resumes_where_it_stopped(run: Path, capsys: pytest.CaptureFixture
     # The last Lightning checkpoint of 210 steps was written at step 200.
     saved = torch.load(run / "last.ckpt", weights_only=True)
     assert saved["global_step"] > 0
-    assert main([*ARGUMENTS, "--optim.steps=230", f"--out={run}", "--resume"]) == 0
+    assert call(*ARGUMENTS, "--optim.steps=230", f"--out={run}", "--resume") == 0
     assert load_prior(run / "builtin-z2").card["configuration"]["optim"]["steps"] == 230
 
 
 def test_resuming_from_nothing_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*ARGUMENTS, f"--out={tmp_path}", "--resume"]) == 2
+    assert call(*ARGUMENTS, f"--out={tmp_path}", "--resume") == 2
     message = capsys.readouterr().err.strip()
     assert "last.ckpt" in message
     assert "\n" not in message
@@ -104,9 +112,21 @@ def test_unknown_outlines_are_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["--data.source=builtin", "--data.only=[teapot]", f"--out={tmp_path / 'x'}"]
-    assert main(arguments) == 2
+    assert call(*arguments) == 2
     assert "teapot" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    "argument", ["--optim.steps=0", "--layout.extent=2", "--optim.between_share=1", "--optim.x=1"]
+)
+def test_bad_settings_are_refused_in_one_line(
+    argument: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(argument) == 2
+    message = capsys.readouterr().err.strip()
+    assert argument[2:].partition("=")[0].split(".")[1] in message
+    assert "\n" not in message
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)

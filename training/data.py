@@ -99,6 +99,8 @@ class Batch(NamedTuple):
     between_sample: Int[Tensor, " s"]
     head: Int[Tensor, " h"]
     consistency: Int[Tensor, " c"]
+    consistency_outline: Int[Tensor, " c"]
+    consistency_start: Int[Tensor, " 1"]
 
 
 class _Draws(IterableDataset):
@@ -129,6 +131,8 @@ class _Draws(IterableDataset):
                 draw(per_latent, between),
                 draw(latents, optim.head_batch),
                 draw(latents, optim.consistency_batch),
+                draw(outlines, optim.consistency_batch),
+                draw(data.targets.shape[1], 1),
             )
 
 

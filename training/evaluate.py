@@ -101,7 +101,8 @@ def support_errors(
 ) -> Float64[np.ndarray, " count"]:
     """Largest difference, over directions, of the head's support from the level set's [mm].
 
-    The level set is traced at 2 mm and its vertices brought onto f = 0 by Newton steps.
+    The level set is traced at 2 mm, its edges are cut in four, so that no tip is missed
+    between two vertices, and all points brought onto f = 0 by Newton steps.
     Latents that do not decode to one closed curve get NaN.
     """
     network = shape.network
@@ -111,7 +112,10 @@ def support_errors(
         if len(level_set.closed) != 1:
             continue
         z = latents[index].to(network.codes.dtype)
-        points = torch.tensor(level_set.closed[0]).to(z) / UNIT
+        vertices = level_set.closed[0]
+        edges = np.roll(vertices, -1, axis=0) - vertices
+        fine = (vertices[:, None] + np.arange(4)[:, None] / 4 * edges[:, None]).reshape(-1, 2)
+        points = torch.tensor(fine).to(z) / UNIT
         for _ in range(2):
             points = project(network, points, z).detach()
         traced = points.double().numpy() * UNIT

@@ -17,23 +17,37 @@ from tpcd.shape.deepsdf import DeepSDFShape
 from tpcd.shape.levelset import decode, decode_many
 
 MM = 1000.0
-BLUE, RED, GREY = "#1f6f9f", "#b3262a", "#9a9a9a"
+BLUE, RED, GREY = "#1f6f9f", "#b3262a", "#c4c4c4"
+BAR_MM = 20.0
+"""Length of the scale bar in the gallery [mm]."""
 
 
 def outline_gallery(
-    shape: DeepSDFShape, outlines: dict[str, Float64[np.ndarray, "_ 2"]], most: int = 42
+    shape: DeepSDFShape,
+    outlines: dict[str, Float64[np.ndarray, "_ 2"]],
+    errors_mm: dict[str, float],
+    most: int = 42,
 ) -> Figure:
-    """True outlines (grey), level sets of f at their codes (blue), head points (red)."""
-    chosen = dict(list(outlines.items())[:most])
-    columns = min(7, len(chosen))
-    rows = math.ceil(len(chosen) / columns)
-    figure = Figure(figsize=(2.2 * columns, 2.4 * rows), layout="constrained")
+    """True and learned outlines at the codes, with the mean error of each; at most `most`."""
+    names = list(outlines)
+    picked = np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int))
+    columns = min(7, len(picked))
+    rows = math.ceil(len(picked) / columns)
+    figure = Figure(figsize=(2.2 * columns, 2.4 * rows + 0.8), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, (name, vertices) in zip(axes.flat, chosen.items(), strict=False):
-        _draw_outline(axis, shape, name, vertices)
-        axis.set_title(name, fontsize=7)
+    for axis, index in zip(axes.flat, picked, strict=False):
+        name = names[index]
+        _draw_outline(axis, shape, name, outlines[name])
+        _draw_scale_bar(axis)
+        axis.set_title(f"{name}\n{errors_mm[name]:.2f} mm", fontsize=8)
+    number = f"{len(picked)} of {len(names)}" if len(picked) < len(names) else f"{len(names)}"
+    figure.suptitle(f"{number} training outlines, mean error of each; bars: {BAR_MM:.0f} mm")
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=3, frameon=False, markerscale=4
+    )
     return figure
 
 
@@ -43,21 +57,22 @@ def worst_outline(
     """One outline enlarged, with axes in mm."""
     figure = Figure(figsize=(8, 8), layout="constrained")
     axis = figure.subplots()
-    _draw_outline(axis, shape, name, vertices, point_size=9)
-    axis.set_title(f"worst outline: {name}, mean error {error_mm:.2f} mm")
+    _draw_outline(axis, shape, name, vertices, point_size=5)
+    axis.set_title(f"worst training outline: {name}, mean error {error_mm:.2f} mm")
     axis.set_xlabel("x [mm]")
     axis.set_ylabel("z [mm]")
     axis.grid(alpha=0.3)
+    axis.legend(loc="best")
     return figure
 
 
 def latent_map(shape: DeepSDFShape, per_side: int = 21) -> Figure:
-    """Decoded outlines on a grid of the latent plane; invalid places have a red cross.
+    """Decoded outlines on a grid of the latent plane; places that are not valid have a cross.
 
     With more than two latents the plane is that of the first two, the others held at the
     nearest training code.
     """
-    figure = Figure(figsize=(12, 12), layout="constrained")
+    figure = Figure(figsize=(12, 12.4), layout="constrained")
     axis = figure.subplots()
     ticks = torch.linspace(-1, 1, per_side, dtype=torch.float64) * (1 - 1 / per_side)
     plane = torch.cartesian_prod(ticks, ticks)
@@ -67,19 +82,32 @@ def latent_map(shape: DeepSDFShape, per_side: int = 21) -> Figure:
     valid = shape.valid(latents)
     pitch = float(ticks[1] - ticks[0])
     factor = 0.9 * pitch / 0.25
-    for where, ok, found in zip(plane, valid, decode_many(shape, latents, 0.004), strict=True):
-        if not ok:
-            axis.plot(*where, "x", color=RED, markersize=4)
+    axis.plot(*plane[~valid].T, "x", color=RED, markersize=4, label="not valid, never drawn")
+    for where, found in zip(plane[valid], decode_many(shape, latents[valid], 0.004), strict=True):
         for curve in found.closed:
             placed = factor * np.vstack((curve, curve[:1])) + where.numpy()
-            axis.plot(*placed.T, color=BLUE if ok else GREY, linewidth=0.8)
-    axis.plot(*codes[:, :2].T, "o", color="black", markersize=3)
-    for name, code in zip(shape.names, codes, strict=True):
-        if len(shape.names) <= 40:
-            axis.annotate(name[:14], code[:2].tolist(), fontsize=7, color="black")
+            axis.plot(*placed.T, color=BLUE, linewidth=0.8)
+    axis.plot([], [], color=BLUE, linewidth=0.8, label="decoded outline")
+    axis.plot(*codes[:, :2].T, "o", color="black", markersize=4, label="training outline")
+    if len(shape.names) <= 40:
+        for name, code in zip(shape.names, codes, strict=True):
+            left = bool(code[0] > 0.7)
+            axis.annotate(
+                name,
+                code[:2].tolist(),
+                xytext=(-4 if left else 4, 0),
+                textcoords="offset points",
+                ha="right" if left else "left",
+                va="center",
+                fontsize=8,
+                bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.5},
+            )
     axis.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), xlabel="latent 0", ylabel="latent 1")
     axis.set_aspect("equal")
-    axis.set_title("decoded outlines; red cross: not valid, never drawn; dots: training outlines")
+    scale = f"distance between centres of neighbours: {MM * pitch / factor:.0f} mm"
+    rest = "" if shape.latent_dim == 2 else ", other latents as at the nearest training outline"
+    axis.set_title(f"latent plane and what it decodes to{rest}; {scale}")
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
@@ -88,12 +116,21 @@ def _draw_outline(
     shape: DeepSDFShape,
     name: str,
     vertices: Float64[np.ndarray, "_ 2"],
-    point_size: float = 2.0,
+    point_size: float = 1.6,
 ) -> None:
     latent = shape.code_of(name)
-    axis.plot(*(MM * np.vstack((vertices, vertices[:1])).T), color=GREY, linewidth=2.5)
+    closed = MM * np.vstack((vertices, vertices[:1]))
+    axis.plot(*closed.T, color=GREY, linewidth=4, label="true outline")
+    label = "learned: zero level set of f"
     for curve in decode(shape, latent).closed:
-        axis.plot(*(MM * np.vstack((curve, curve[:1])).T), color=BLUE, linewidth=0.9)
+        axis.plot(*(MM * np.vstack((curve, curve[:1])).T), color=BLUE, linewidth=1, label=label)
+        label = "_more"
     head = MM * shape.boundary_points(latent).detach().numpy()
-    axis.plot(*head.T, ".", color=RED, markersize=point_size)
+    axis.plot(*head.T, ".", color=RED, markersize=point_size, label="learned: points of the head")
     axis.set_aspect("equal")
+
+
+def _draw_scale_bar(axis: Axes) -> None:
+    left, right = axis.get_xlim()
+    low = axis.get_ylim()[0] - 0.06 * (right - left)
+    axis.plot([left, left + BAR_MM], [low, low], color="black", linewidth=2)

@@ -6,12 +6,11 @@ they are not the ones that the prior was trained on.
 
 from __future__ import annotations
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 
-from jsonargparse import ArgumentParser
-
-from tpcd.errors import CheckpointError, TpcdError
+from tpcd.cli import run
+from tpcd.errors import CheckpointError
 from training.config import (
     CheckConfig,
     DataConfig,
@@ -22,13 +21,24 @@ from training.config import (
 )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    parser = ArgumentParser(prog="python -m training.measure", description=__doc__)
-    parser.add_argument("prior", type=str, help="checkpoint folder or name")
-    parser.add_argument("--out", type=str, default="", help="folder for figures")
-    parser.add_argument("--threads", type=int, default=1, help="torch threads")
-    options = parser.parse_args(arguments)
+@dataclass(frozen=True)
+class Measuring:
+    """Settings of the command."""
+
+    prior: str
+    """Checkpoint folder, or the name of a shipped prior."""
+    out: Path | None = None
+    """Folder for figures and TensorBoard; by default runs/measure-NAME."""
+    threads: int = 1
+    """Torch threads."""
+
+    def __post_init__(self) -> None:
+        if self.threads < 1:
+            raise ValueError(f"threads is {self.threads}, expected at least 1")
+
+
+def measure(config: Measuring) -> None:
+    """Measure a prior again and renew its card."""
     import numpy as np
     import torch
 
@@ -36,24 +46,19 @@ def main(arguments: list[str] | None = None) -> int:
     from training.outlines import data_hash, training_outlines
     from training.run import complete_card
 
-    torch.set_num_threads(options.threads)
-    try:
-        folder = find_prior(options.prior)
-        card = load_prior(folder).card
-        config = config_of(dict(card["configuration"]))
-        outlines = training_outlines(config.data, np.random.default_rng(config.optim.seed))
-        if data_hash(outlines) != card["data_sha256"]:
-            raise CheckpointError(
-                folder, "was trained on other outlines than are here", "train it again"
-            )
-        out = Path(options.out or Path("runs") / f"measure-{folder.name}")
-        out.mkdir(parents=True, exist_ok=True)
-        complete_card(folder, outlines, config, out)
-    except TpcdError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    torch.set_num_threads(config.threads)
+    folder = find_prior(config.prior)
+    card = load_prior(folder).card
+    trained = config_of(dict(card["configuration"]))
+    outlines = training_outlines(trained.data, np.random.default_rng(trained.optim.seed))
+    if data_hash(outlines) != card["data_sha256"]:
+        raise CheckpointError(
+            folder, "was trained on other outlines than are here", "train it again"
+        )
+    out = config.out or Path("runs") / f"measure-{folder.name}"
+    out.mkdir(parents=True, exist_ok=True)
+    complete_card(folder, outlines, trained, out)
     print(f"card of {folder} renewed; figures in {out}")
-    return 0
 
 
 def config_of(saved: dict) -> TrainingConfig:
@@ -69,4 +74,4 @@ def config_of(saved: dict) -> TrainingConfig:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run(measure, Measuring, positional=("prior",))

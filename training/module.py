@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from lightning import LightningModule
 from torch import Tensor, nn
 
@@ -38,9 +38,9 @@ class PriorModule(LightningModule):
         self.data, self.config = prepared, config
         self.network = initial_network(prepared, config)
 
-    def between_latents(self) -> Float[Tensor, "m z"]:
-        """Current latents in between; they follow the codes."""
-        return self.data.weights @ self.network.codes + self.data.offsets
+    def between_latents(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k z"]:
+        """Current latents in between of these indices; they follow the codes."""
+        return self.data.weights[index] @ self.network.codes + self.data.offsets[index]
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """One step of both optimisers."""
@@ -62,22 +62,17 @@ class PriorModule(LightningModule):
     def loss_terms(self, batch: Batch, consistent: bool) -> dict[str, Tensor]:
         """Weighted terms of the loss; `consistent` adds f(g(z); z)^2."""
         data, optim, network = self.data, self.config.optim, self.network
-        latents = data.weights[batch.between] @ network.codes + data.offsets[batch.between]
-        terms = self._distance_terms(batch, latents)
+        terms = self._distance_terms(batch, self.between_latents(batch.between))
         # The head learns where the latents are; it does not move them.
-        latents, codes = self.between_latents().detach(), network.codes.detach()
+        latents, codes = self.between_latents(batch.head).detach(), network.codes.detach()
         simple = data.simple[batch.head].float()
-        between_error = (network.outline(latents[batch.head]) - data.morphs[batch.head]).square()
+        between_error = (network.outline(latents) - data.morphs[batch.head]).square()
         object_error = (network.outline(codes) - data.targets).square()
         terms["head"] = optim.head_weight * (
             (between_error.sum(-1).mean(-1) * simple).mean() + object_error.sum(-1).mean()
         )
         if consistent:
-            z = latents[batch.consistency]
-            value = network.distance(network.outline(z), z).square().mean(-1)
-            value = (value * data.simple[batch.consistency]).mean()
-            at_codes = network.distance(network.outline(codes), codes).square().mean()
-            terms["consistency"] = optim.consistency_weight * (value + at_codes)
+            terms["consistency"] = optim.consistency_weight * self._consistency(batch)
         return terms
 
     def _distance_terms(self, batch: Batch, latents: Tensor) -> dict[str, Tensor]:
@@ -103,6 +98,19 @@ class PriorModule(LightningModule):
             "gradient": self.config.optim.gradient_weight
             * (near * (gradient - normal).square().sum(-1)).mean(),
         }
+
+    def _consistency(self, batch: Batch) -> Tensor:
+        """Mean f(g(z); z)^2, over latents in between plus over outlines."""
+        codes = self.network.codes.detach()
+        between = self.between_latents(batch.consistency).detach()
+        z = torch.cat((between, codes[batch.consistency_outline]))
+        points = self.network.outline(z)
+        # A few points of many outlines teach as much as all points of few.
+        stride = max(1, points.shape[1] // self.config.optim.consistency_points)
+        some = points.roll(int(batch.consistency_start), 1)[:, ::stride]
+        square = self.network.distance(some, z).square().mean(-1)
+        counts = self.data.simple[batch.consistency].float()
+        return (square[: len(counts)] * counts).mean() + square[len(counts) :].mean()
 
     def configure_optimizers(self) -> tuple[list, list]:
         """Adam and Muon, see `rates`; the schedules are stepped with them."""

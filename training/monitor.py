@@ -69,7 +69,7 @@ def log_figures(
     """Write the gallery, the latent map and the worst outline to TensorBoard and as PNG."""
     worst = max(errors_mm, key=lambda name: errors_mm[name])
     figures = {
-        "outlines": outline_gallery(shape, outlines),
+        "outlines": outline_gallery(shape, outlines, errors_mm),
         "latent_map": latent_map(shape),
         "worst": worst_outline(shape, worst, outlines[worst], errors_mm[worst]),
     }

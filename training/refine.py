@@ -1,24 +1,31 @@
 """Last stage: the outline head is taught the level set that the finished f really has.
 
-The head's points are brought onto f = 0 by Newton steps at every training latent, and the
-head learns these positions by least squares. That costs far less than evaluating f in every
-step, and what is left is the head's own resolution.
+The head's points are brought onto f = 0 by Newton steps at many latents, and the head learns
+these positions by least squares. That costs far less than evaluating f in every step, and
+what is left is the head's own resolution. It is spent on the distance from the level set:
+deviations along the outline change neither outline nor support and count little.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.shape.deepsdf import DeepSDFNetwork, project
+from tpcd.shape.deepsdf import DeepSDFNetwork
 from training.config import OptimConfig
 from training.rates import cosine_rate, split_optimizers
 
 PROJECTIONS = 2
-"""Newton steps; points that are then still off by more than `ACCURACY` teach nothing."""
-ACCURACY = 0.002
-"""Largest |f| of a target, in the networks' unit (0.2 mm)."""
+"""Newton steps; points at which the last one is longer than `ACCURACY` teach nothing."""
+ACCURACY = 0.01
+"""Longest last step, in the networks' unit (1 mm); what is left then is of second order."""
+LEAST_SLOPE = 0.2
+"""Where |grad f| is less, a step is as long as if it were this."""
+ALONG = 0.05
+"""Weight of a squared deviation along the outline, against 1 across it."""
 REACH = 0.04
 """Longest way from head point to target, in the networks' unit (4 mm)."""
 
@@ -26,37 +33,52 @@ REACH = 0.04
 def refine_head(
     network: DeepSDFNetwork, latents: Float[Tensor, "m z"], config: OptimConfig
 ) -> None:
-    """Train the head in place on projected points at `latents`; f and codes stay."""
-    latents = latents[: config.refine_latents]
+    """Train the head in place on projected points at `latents`; f and codes stay.
+
+    The latents should be as the prior will draw them: between the latents of training the
+    head strays further from the level set than at them.
+    """
     latents = torch.cat((latents, network.codes.detach().repeat(8, 1)))
     for stage in range(config.refine_rounds):
-        targets, counts = projected_outlines(network, latents)
-        _fit_head(network, latents, targets, counts, config, stage)
+        targets = projected_outlines(network, latents)
+        _fit_head(network, latents, targets, config, stage)
 
 
-def projected_outlines(
-    network: DeepSDFNetwork, latents: Float[Tensor, "m z"]
-) -> tuple[Float[Tensor, "m p 2"], Float[Tensor, "m p"]]:
-    """Head points moved onto the zero level set, and 1 where that succeeded, else 0."""
-    targets, counts = [], []
+@dataclass(frozen=True, eq=False)
+class HeadTargets:
+    """Where the head's points should lie, for m latents; lengths in `UNIT`."""
+
+    points: Float[Tensor, "m p 2"]
+    """Head points moved onto the zero level set."""
+    normals: Float[Tensor, "m p 2"]
+    """Unit normals of the level set there."""
+    counts: Float[Tensor, "m p"]
+    """1 where a point got onto the level set, else 0."""
+
+
+def projected_outlines(network: DeepSDFNetwork, latents: Float[Tensor, "m z"]) -> HeadTargets:
+    """Bring the head's points onto the zero level set."""
+    parts = []
     for z in latents.split(250):
-        start = network.outline(z).detach()
-        points = start
+        start = points = network.outline(z).detach()
         for _ in range(PROJECTIONS):
-            points = project(network, points, z).detach()
-        with torch.no_grad():
-            on_level = network.distance(points, z).abs() < ACCURACY
+            at = points.requires_grad_()
+            value = network.distance(at, z)
+            gradient = torch.autograd.grad(value.sum(), at)[0]
+            slope = gradient.norm(dim=-1, keepdim=True)
+            normal = gradient / slope.clamp_min(1e-9)
+            step = value.detach()[..., None] / slope.clamp_min(LEAST_SLOPE)
+            points = at.detach() - step * normal
         near = (points - start).norm(dim=-1) < REACH
-        targets.append(points)
-        counts.append((on_level & near).float())
-    return torch.cat(targets), torch.cat(counts)
+        counts = (step[..., 0].abs() < ACCURACY) & near
+        parts.append((points, normal, counts.float()))
+    return HeadTargets(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
 def _fit_head(
     network: DeepSDFNetwork,
     latents: Tensor,
-    targets: Tensor,
-    counts: Tensor,
+    targets: HeadTargets,
     config: OptimConfig,
     stage: int,
 ) -> None:
@@ -69,8 +91,10 @@ def _fit_head(
     network.head.requires_grad_(True)
     for _ in range(config.refine_steps):
         pick = torch.randint(len(latents), (config.head_batch,), generator=generator)
-        error = (network.outline(latents[pick]) - targets[pick]).square().sum(-1)
-        loss = (error * counts[pick]).mean()
+        offset = network.outline(latents[pick]) - targets.points[pick]
+        away = (offset * targets.normals[pick]).sum(-1).square()
+        error = (1 - ALONG) * away + ALONG * offset.square().sum(-1)
+        loss = (error * targets.counts[pick]).mean()
         for optimizer in optimizers:
             optimizer.zero_grad()
         loss.backward()

@@ -50,15 +50,18 @@ def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False)
     if resume and not last.is_file():
         raise RunError(out, "holds no last.ckpt to resume from", "leave out --resume")
     torch.set_num_threads(config.optim.threads)
-    began = time.process_time()
+    began, began_cpu = time.perf_counter(), time.process_time()
     prepared = prepare(config)
     out.mkdir(parents=True, exist_ok=True)
     resolved = yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
     (out / "config.yaml").write_text(resolved, encoding="utf-8")
     module = PriorModule(prepared, config)
     _fit(module, prepared, config, out, last if resume else None)
-    refine_head(module.network, _simple_latents(module), config.optim)
-    seconds = time.process_time() - began
+    refine_head(module.network, _latents_to_refine(module), config.optim)
+    seconds = {
+        "training_wall_seconds": round(time.perf_counter() - began, 1),
+        "training_cpu_seconds": round(time.process_time() - began_cpu, 1),
+    }
     export_prior(module.network.eval().requires_grad_(False), prepared, config, export, seconds)
     outlines = dict(zip(prepared.names, prepared.vertices, strict=True))
     return complete_card(export, outlines, config, out)
@@ -69,7 +72,7 @@ def export_prior(
     prepared: Prepared,
     config: TrainingConfig,
     folder: Path,
-    seconds: float,
+    seconds: dict[str, float],
 ) -> Path:
     """Find the valid region and write the prior, not measured yet."""
     density = (
@@ -83,7 +86,7 @@ def export_prior(
         "created": time.strftime("%Y-%m-%d"),
         "data_sha256": prepared.data_hash,
         "licence": "MIT; outlines made in code" if config.data.source == "builtin" else ATTRIBUTION,
-        "training_cpu_seconds": round(seconds, 1),
+        **seconds,
         "threads": config.optim.threads,
         "configuration": dataclasses.asdict(config),
         "versions": {"python": platform.python_version()} | {p: version(p) for p in PACKAGES},
@@ -152,8 +155,10 @@ def _fit(
     )
 
 
-def _simple_latents(module: PriorModule) -> torch.Tensor:
-    """Latents in between whose target does not cross itself, shuffled."""
-    latents = module.between_latents().detach()[module.data.simple]
-    generator = torch.Generator().manual_seed(module.config.optim.seed)
-    return latents[torch.randperm(len(latents), generator=generator)]
+def _latents_to_refine(module: PriorModule) -> torch.Tensor:
+    """Latents spread as the prior will draw them: over the square, or from the mixture."""
+    optim, mixture = module.config.optim, module.data.mixture
+    rng = np.random.default_rng(optim.seed + 3)
+    count, z = optim.refine_latents, module.network.codes.shape[1]
+    drawn = rng.uniform(-1, 1, (count, z)) if mixture is None else mixture.draw(count, rng)
+    return torch.from_numpy(drawn).float().clamp(-1, 1)

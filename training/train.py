@@ -6,44 +6,44 @@ configuration) and, at the end, the released prior: safetensors and a JSON card.
 
 from __future__ import annotations
 
-import sys
 import time
+from dataclasses import dataclass, fields
 from pathlib import Path
 
-from jsonargparse import ActionConfigFile, ArgumentParser
-
-from tpcd.errors import TpcdError
+from tpcd.cli import run
 from training.config import TrainingConfig
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    parser = ArgumentParser(prog="python -m training.train", description=__doc__)
-    parser.add_argument("--config", action=ActionConfigFile, help="YAML file of a prior")
-    parser.add_class_arguments(TrainingConfig, as_group=False)
-    parser.add_argument("--out", type=str, default="", help="run folder (default runs/NAME)")
-    parser.add_argument(
-        "--export", type=str, default="", help="checkpoint folder (default OUT/NAME)"
-    )
-    parser.add_argument("--resume", action="store_true", help="go on from OUT's last checkpoint")
-    parser.add_argument("--debug", action="store_true", help="show tracebacks")
-    options = parser.instantiate(parser.parse_args(arguments))
-    config = TrainingConfig(**{name: options[name] for name in TrainingConfig.__dataclass_fields__})
-    out = Path(options.out or Path("runs") / config.name)
+@dataclass(frozen=True)
+class Training(TrainingConfig):
+    """One prior, and where it goes."""
+
+    name: str = "prior"
+    """Name of the prior and of its checkpoint folder."""
+    unseen_from: str = ""
+    """Prior of the same recipe with objects left out, whose unseen errors the card quotes."""
+    out: Path | None = None
+    """Run folder; by default runs/NAME."""
+    export: Path | None = None
+    """Checkpoint folder of the finished prior; by default OUT/NAME."""
+    resume: bool = False
+    """Go on from the last checkpoint in the run folder."""
+
+
+def train_prior(config: Training) -> None:
+    """Train a shape prior, measure it and write it with its card."""
     # torch and Lightning take seconds to import; --help should not wait for them.
     from training.run import train
 
-    try:
-        began = time.process_time()
-        folder = train(config, out, Path(options.export or out / config.name), options.resume)
-        print(f"prior written to {folder} ({time.process_time() - began:.0f} CPU s in all)")
-    except (TpcdError, ValueError) as error:
-        if options.debug:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return getattr(error, "exit_code", 2)
-    return 0
+    settings = {field.name: getattr(config, field.name) for field in fields(TrainingConfig)}
+    out = config.out or Path("runs") / config.name
+    began, began_cpu = time.perf_counter(), time.process_time()
+    folder = train(
+        TrainingConfig(**settings), out, config.export or out / config.name, config.resume
+    )
+    wall, cpu = time.perf_counter() - began, time.process_time() - began_cpu
+    print(f"prior written to {folder} (measuring included: {wall:.0f} s, {cpu:.0f} CPU s)")
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run(train_prior, Training)

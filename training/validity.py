@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from tpcd.errors import TpcdError
 from tpcd.shape.deepsdf import DeepSDFNetwork, DeepSDFShape
@@ -27,6 +27,8 @@ class TrainingError(TpcdError):
 
 FARTHEST_HEAD = 0.005
 """A latent is not valid where the head strays from the level set by more than this [m]."""
+FARTHEST_FROM_CODES = 0.002
+"""Nor, away from the codes, by more than this [m] (two dimensions)."""
 LARGEST_KNOT = 0.03
 """Nor where the head's polygon crosses itself and loses more than this share of its area."""
 LEFT_OUT = 0.02
@@ -65,15 +67,23 @@ def head_is_sound(
     """
     sound = []
     for some in latents.split(500):
-        with torch.no_grad():
-            points = shape.boundary_points(some)
-            distance = shape.signed_distance(points, some).abs().amax(-1).numpy()
-        polygons = shapely.polygons(points.double().numpy())
-        good = distance < FARTHEST_HEAD
+        good = (_straying(shape, some) < FARTHEST_HEAD).numpy()
+        polygons = shapely.polygons(shape.boundary_points(some).detach().double().numpy())
         crossed = good & ~shapely.is_valid(polygons)
         good[crossed] = [_knot_share(polygon) < LARGEST_KNOT for polygon in polygons[crossed]]
         sound.append(good)
     return np.concatenate(sound)
+
+
+def _straying(shape: DeepSDFShape, latents: Float[Tensor, "count z"]) -> Float[Tensor, " count"]:
+    """Largest |f| at the head's points [m]."""
+    with torch.no_grad():
+        return torch.cat(
+            [
+                shape.signed_distance(shape.boundary_points(some), some).abs().amax(-1)
+                for some in latents.split(500)
+            ]
+        )
 
 
 def _knot_share(polygon: shapely.Polygon) -> float:
@@ -84,15 +94,26 @@ def _knot_share(polygon: shapely.Polygon) -> float:
 
 
 def fit_mask(network: DeepSDFNetwork, cells: int) -> MaskDensity:
-    """Mark the cells of the square whose four corners all decode well."""
+    """Mark the cells of the square whose four corners all decode well.
+
+    Away from the codes the head must also stray by less than `FARTHEST_FROM_CODES` at the
+    corners, the middles of the edges and the centre; at the codes that would cut off training
+    outlines with thin parts, where the head strays next to them.
+    """
     everywhere = MaskDensity(torch.ones(1, 1, dtype=torch.bool))
     shape = DeepSDFShape(network, everywhere)
-    ticks = torch.linspace(-1, 1, cells + 1, dtype=torch.float64)
-    nodes = torch.cartesian_prod(ticks, ticks)
+    ticks = torch.linspace(-1, 1, 2 * cells + 1, dtype=torch.float64)
+    nodes = torch.cartesian_prod(ticks[::2], ticks[::2])
     good = torch.from_numpy(decodes_well(shape, nodes)).reshape(cells + 1, cells + 1)
     if not good.any():
         raise TrainingError("no latent decodes to one closed outline; train for more steps")
-    return MaskDensity(good[1:, 1:] & good[:-1, 1:] & good[1:, :-1] & good[:-1, :-1])
+    corners = good[1:, 1:] & good[:-1, 1:] & good[1:, :-1] & good[:-1, :-1]
+    straying = _straying(shape, torch.cartesian_prod(ticks, ticks))
+    farthest = nn.functional.max_pool2d(straying.reshape(1, 1, len(ticks), -1), 3, 2)[0, 0]
+    centres = (ticks[1::2, None].expand(-1, cells), ticks[1::2].expand(cells, -1))
+    apart = torch.stack(centres, dim=-1)[..., None, :] - network.codes.detach()
+    at_codes = (apart.abs().amax(-1) <= 3 / cells).any(-1)
+    return MaskDensity(corners & ((farthest < FARTHEST_FROM_CODES) | at_codes))
 
 
 def fit_truncated_mixture(

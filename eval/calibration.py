@@ -59,7 +59,7 @@ class Calibration:
     quick: bool = False
     """A built-in outline instead of the shape prior, and few particles."""
     particles: int = 0
-    """Particles; 0 takes 1000 (default) or 5000 (paper), with --quick 300 or 1000."""
+    """Particles; 0 takes 700 (default) or 5000 (paper), with --quick 300 or 1000."""
     seed: int = 0
     """Run r takes seed + r."""
 
@@ -240,7 +240,7 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     from tpcd.belief.prior import make_prior
     from tpcd.belief.smc import SamplerSettings
 
-    few = {"default": 300, "paper": 1000} if config.quick else {"default": 1000, "paper": 5000}
+    few = {"default": 300, "paper": 1000} if config.quick else {"default": 700, "paper": 5000}
     particles = config.particles or few[config.estimator]
     settings = EstimatorSettings(sampler=SamplerSettings(particles=particles))
     generator = torch.Generator().manual_seed(seed)

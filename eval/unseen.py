@@ -72,7 +72,7 @@ class Unseen:
     """Exploration motion: rich or press_and_slide."""
     estimator: str = "default"
     """Estimator: default or paper."""
-    particles: int = 1000
+    particles: int = 700
     """Particles of the belief."""
     misfit: float | None = None
     """Median of the outline error's standard deviation [m]; by default the prior's own figure."""

@@ -21,7 +21,7 @@ class Estimate:
     """Folder for the results; a stopped run in it goes on with --resume."""
     estimator: Literal["default", "paper"] = "default"
     """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
-    particles: int = 1000
+    particles: int = 700
     """Particles of the belief (the filter `paper` has its own number)."""
     misfit: float | None = None
     """Median of the outline error's standard deviation [m]; by default the prior's own figure."""

@@ -126,7 +126,8 @@ def estimate(
     misfit = misfit_field(shape, settings)
     model = _Model(prior, misfit, settings.step)
     if state is None:
-        cloud = start_cloud(model.sample(settings.sampler.particles, generator), model.log_prior)
+        count = settings.sampler.particles_at(1)
+        cloud = start_cloud(model.sample(count, generator), model.log_prior)
     else:
         cloud = cloud_from_tensors(state.restore(generator))
     for k in range(1 if state is None else state.index + 1, len(history) + 1):
@@ -140,7 +141,12 @@ def estimate(
             return found.before, found.total
 
         cloud, info = assimilate(
-            cloud, model.log_prior, log_likelihood, settings.sampler, generator
+            cloud,
+            model.log_prior,
+            log_likelihood,
+            settings.sampler,
+            generator,
+            settings.sampler.particles_at(k),
         )
         belief = model.belief(cloud, so_far)
         seconds = time.perf_counter() - started

@@ -43,8 +43,11 @@ _MIXTURE = "mixture."
 class SamplerSettings:
     """Budget and shape of the sampler."""
 
-    particles: int = 1000
-    """Particles in the cloud."""
+    particles: int = 700
+    """Particles in the cloud once the history is long."""
+    early_factor: float = 16.0
+    """So many times more particles at the first datum, falling as 1 / k with datum k: while the
+    history is short they are cheap, and the posterior is spread over many shapes."""
     kept_share: float = 0.5
     """Share of the effective sample size that one temperature step keeps."""
     components: int = 8
@@ -55,7 +58,7 @@ class SamplerSettings:
     """Moves at full likelihood once the datum is in."""
     moves_per_fit: int = 4
     """The mixture is fitted again to the moved particles after so many moves."""
-    independent_share: float = 0.75
+    independent_share: float = 0.5
     """Share of moves that are independent draws from the mixture; the rest are local steps."""
 
     def __post_init__(self) -> None:
@@ -65,6 +68,8 @@ class SamplerSettings:
                 f"particles {self.particles} must be >= 16, kept_share {self.kept_share} in "
                 f"(0, 1), components {self.components} >= 1"
             )
+        if self.early_factor < 1:
+            raise ValueError(f"early_factor is {self.early_factor}, expected at least 1")
         if min(self.tempering_moves, self.final_moves) < 0 or self.moves_per_fit < 1:
             raise ValueError(
                 f"tempering_moves {self.tempering_moves} and final_moves {self.final_moves} "
@@ -72,6 +77,11 @@ class SamplerSettings:
             )
         if not 0 <= self.independent_share <= 1:
             raise ValueError(f"independent_share is {self.independent_share}, expected 0 to 1")
+
+
+    def particles_at(self, datum: int) -> int:
+        """Particles in the cloud when datum 1, 2, ... is brought in."""
+        return round(self.particles * max(1.0, self.early_factor / datum))
 
 
 @dataclass(frozen=True)
@@ -146,8 +156,9 @@ def assimilate(
     log_likelihood: LogLikelihood,
     settings: SamplerSettings,
     generator: torch.Generator,
+    count: int | None = None,
 ) -> tuple[Cloud, CloudInfo]:
-    """Bring one datum into the cloud.
+    """Bring one datum into the cloud, which then has `count` particles (None: as before).
 
     Raises ValueError where no particle can explain the datum at all.
     """
@@ -164,7 +175,7 @@ def assimilate(
         smallest = min(smallest, effective_sample_size(weights))
         state = state.weighted(log_weights, weights)
         mixture = _fit(state.cloud.positions, weights, settings, generator, mixture)
-        state = state.take(systematic_resample(weights, len(weights), generator))
+        state = state.take(systematic_resample(weights, count or len(weights), generator))
         temperature += advance
         last = temperature >= 1.0
         state, mixture = _move(
@@ -268,6 +279,10 @@ def _fit(
 ) -> StudentMixture:
     """The mixture of the cloud; from the one before it takes a few rounds only."""
     rounds = 30 if before is None else 6
+    if len(positions) > settings.particles:
+        chosen = systematic_resample(weights, settings.particles, generator)
+        positions = positions[chosen]
+        weights = torch.full_like(weights[chosen], 1.0 / len(chosen))
     return fit_student_mixture(
         positions, weights, settings.components, generator, rounds, start=before
     )

@@ -221,6 +221,7 @@ class _State:
             cloud,
             positions=cloud.positions[index],
             log_prior=cloud.log_prior[index],
+            log_likelihood=cloud.log_likelihood[index],
             ancestor=cloud.ancestor[index],
         )
         return _State(cloud, self.before[index], self.with_datum[index])

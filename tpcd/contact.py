@@ -80,9 +80,15 @@ def place_points(
     return transform_points(mount, scale[..., None, None] * points_object)
 
 
-def scene_from_parameters(shape: Shape, parameters: Parameters) -> ContactScene:
-    """The scene that theta describes: decoded outline, floor and wall, one friction for both."""
-    points = shape.boundary_points(parameters.latent)
+def scene_from_parameters(
+    shape: Shape, parameters: Parameters, points: Float[Tensor, "*batch p 2"] | None = None
+) -> ContactScene:
+    """The scene that theta describes: decoded outline, floor and wall, one friction for both.
+
+    `points` are the outlines of the latents where they are decoded already.
+    """
+    if points is None:
+        points = shape.boundary_points(parameters.latent)
     friction = parameters.friction[..., None]
     return ContactScene(
         points_ee=place_points(points, parameters.scale, parameters.mount),

@@ -69,10 +69,12 @@ def history_likelihood(
             return _without(
                 hopeless, shape, parameters, misfit_sd, history, field, settings, threshold
             )
-    scene = scene_from_parameters(shape, parameters)
-    inputs = (scene.points_ee, scene.friction, parameters.to_vector(), misfit_sd)
-    if scene.friction.device.type == "cpu" and native.available() and not needs_gradient(*inputs):
+    inputs = (parameters.to_vector(), misfit_sd)
+    if misfit_sd.device.type == "cpu" and native.available() and not needs_gradient(*inputs):
+        points = native.decode(shape, parameters.latent)
+        scene = scene_from_parameters(shape, parameters, points)
         return _compiled(scene, misfit_sd, history, field, settings, threshold)
+    scene = scene_from_parameters(shape, parameters)
     return _filter(scene, misfit_sd, history, field, settings)
 
 

@@ -78,7 +78,6 @@ class SamplerSettings:
         if not 0 <= self.independent_share <= 1:
             raise ValueError(f"independent_share is {self.independent_share}, expected 0 to 1")
 
-
     def particles_at(self, datum: int) -> int:
         """Particles in the cloud when datum 1, 2, ... is brought in."""
         return round(self.particles * max(1.0, self.early_factor / datum))

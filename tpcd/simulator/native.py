@@ -24,6 +24,7 @@ from tpcd.simulator.record import StepSettings, Transition
 from tpcd.terrain import HalfPlane
 
 if TYPE_CHECKING:
+    from tpcd.shape.protocol import Shape
     from tpcd.simulator.kernel import Request
     from tpcd.simulator.kernel_geometry import World
     from tpcd.simulator.kernel_settle import Law
@@ -59,6 +60,20 @@ def in_parts(work: Callable[[int, int], None], count: int) -> None:
     parts = min(4 * threads, math.ceil(count / CHUNK))
     bounds = [part * count // parts for part in range(parts + 1)]
     list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
+
+
+def decode(shape: Shape, latent: Float[Tensor, "m z"]) -> Float[Tensor, "m p 2"]:
+    """Outline points of m latents, shared among the same threads; records no gradient."""
+    threads = min(thread_count(), math.ceil(len(latent) / CHUNK))
+
+    def part(latents: Tensor) -> Tensor:
+        # Whether gradients are recorded is a setting of each thread.
+        with torch.no_grad():
+            return shape.boundary_points(latents)
+
+    if threads <= 1:
+        return part(latent)
+    return torch.cat(list(_pool(threads).map(part, latent.tensor_split(threads))))
 
 
 @cache

@@ -81,17 +81,18 @@ def place_points(
 
 
 def scene_from_parameters(
-    shape: Shape, parameters: Parameters, points: Float[Tensor, "*batch p 2"] | None = None
+    shape: Shape, parameters: Parameters, points_ee: Float[Tensor, "*batch p 2"] | None = None
 ) -> ContactScene:
     """The scene that theta describes: decoded outline, floor and wall, one friction for both.
 
-    `points` are the outlines of the latents where they are decoded already.
+    `points_ee` are the outlines in the end-effector frame where they are decoded already.
     """
-    if points is None:
+    if points_ee is None:
         points = shape.boundary_points(parameters.latent)
+        points_ee = place_points(points, parameters.scale, parameters.mount)
     friction = parameters.friction[..., None]
     return ContactScene(
-        points_ee=place_points(points, parameters.scale, parameters.mount),
+        points_ee=points_ee,
         terrains=(floor(parameters.floor_height), wall(parameters.wall_position)),
         friction=torch.cat((friction, friction), dim=-1),
     )

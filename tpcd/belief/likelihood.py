@@ -71,8 +71,7 @@ def history_likelihood(
             )
     inputs = (parameters.to_vector(), misfit_sd)
     if misfit_sd.device.type == "cpu" and native.available() and not needs_gradient(*inputs):
-        points = native.decode(shape, parameters.latent)
-        scene = scene_from_parameters(shape, parameters, points)
+        scene = scene_from_parameters(shape, parameters, native.outlines(shape, parameters))
         return _compiled(scene, misfit_sd, history, field, settings, threshold)
     scene = scene_from_parameters(shape, parameters)
     return _filter(scene, misfit_sd, history, field, settings)

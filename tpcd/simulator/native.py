@@ -18,7 +18,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tpcd.contact import ContactScene
+from tpcd.contact import ContactScene, place_points
+from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.simulator.record import StepSettings, Transition
 from tpcd.terrain import HalfPlane
@@ -62,18 +63,23 @@ def in_parts(work: Callable[[int, int], None], count: int) -> None:
     list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
 
 
-def decode(shape: Shape, latent: Float[Tensor, "m z"]) -> Float[Tensor, "m p 2"]:
-    """Outline points of m latents, shared among the same threads; records no gradient."""
-    threads = min(thread_count(), math.ceil(len(latent) / CHUNK))
+def outlines(shape: Shape, parameters: Parameters) -> Float[Tensor, "m p 2"]:
+    """Outline points of m particles in the end-effector frame [m], decoded in the same threads.
 
-    def part(latents: Tensor) -> Tensor:
+    Records no gradient.
+    """
+    theta = parameters.to_vector()
+    threads = min(thread_count(), math.ceil(len(theta) / CHUNK))
+
+    def part(vectors: Tensor) -> Tensor:
+        own = Parameters.from_vector(vectors)
         # Whether gradients are recorded is a setting of each thread.
         with torch.no_grad():
-            return shape.boundary_points(latents)
+            return place_points(shape.boundary_points(own.latent), own.scale, own.mount)
 
     if threads <= 1:
-        return part(latent)
-    return torch.cat(list(_pool(threads).map(part, latent.tensor_split(threads))))
+        return part(theta)
+    return torch.cat(list(_pool(threads).map(part, theta.tensor_split(threads))))
 
 
 @cache

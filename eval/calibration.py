@@ -236,9 +236,9 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     import torch
 
     from tpcd.belief.belief import EstimatorSettings, estimate
+    from tpcd.belief.cloud import SamplerSettings
     from tpcd.belief.paper import PaperSettings, estimate_paper
     from tpcd.belief.prior import make_prior
-    from tpcd.belief.smc import SamplerSettings
 
     few = {"default": 300, "paper": 1000} if config.quick else {"default": 700, "paper": 5000}
     particles = config.particles or few[config.estimator]

@@ -119,9 +119,10 @@ def simulate(config: Simulation) -> None:
 
     from tpcd.data.episode import write_together
     from tpcd.parameters import SCENE_NAMES
-    from tpcd.results import check_target, to_plain, versions
+    from tpcd.results import check_target, to_plain
     from tpcd.truth.recording import make_motion, record, recording_contents
     from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.versions import versions
 
     torch.set_num_threads(1)
     name = config.name or config.policy

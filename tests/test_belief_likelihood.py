@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.belief import EstimatorSettings, estimate
+from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.history import PARITY_LIMIT, History, history_of, parity_chi_square
 from tpcd.belief.likelihood import (
     HistoryLikelihood,
@@ -19,7 +20,6 @@ from tpcd.belief.likelihood import (
 )
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
-from tpcd.belief.smc import SamplerSettings
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters

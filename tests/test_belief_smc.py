@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.smc import Cloud, SamplerSettings, assimilate, start_cloud
+from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
+from tpcd.belief.smc import assimilate
 
 DIMENSION = 3
 NOISE = 0.3
@@ -130,6 +131,31 @@ def test_permuting_the_particles_changes_the_answer_by_chance_only() -> None:
     std = model.posterior(3)[1].diagonal().sqrt()
     assert ((means[0] - means[1]) / std).abs().max() < 0.2
     assert abs(evidence[0] - evidence[1]) < 0.3
+
+
+def test_a_cloud_that_is_thinned_still_has_the_posterior_and_the_evidence() -> None:
+    """Six times as many particles at the first datum, 1 / k of them at datum k."""
+    settings = SamplerSettings(particles=2000, early_factor=6.0)
+    assert [settings.particles_at(k) for k in (1, 2, 3, 6, 9)] == [12000, 6000, 4000, 2000, 2000]
+    model = LinearModel(4, seed=3)
+    generator = torch.Generator().manual_seed(0)
+    count = settings.particles_at(1)
+    start = torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+    cloud = start_cloud(start, model.log_prior)
+    for k in range(4):
+        cloud, _ = assimilate(
+            cloud,
+            model.log_prior,
+            model.log_likelihood(k, k + 1),
+            settings,
+            generator,
+            settings.particles_at(k + 1),
+        )
+        assert len(cloud.positions) == len(cloud.log_likelihood) == settings.particles_at(k + 1)
+    mean, covariance, evidence = model.posterior(4)
+    error = (cloud.positions.mean(0) - mean) / covariance.diagonal().sqrt()
+    assert error.abs().max() < 0.1
+    assert cloud.log_evidence == pytest.approx(evidence, abs=0.15)
 
 
 def test_one_chunk_or_many_give_the_same_cloud() -> None:

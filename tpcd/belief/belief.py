@@ -16,19 +16,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.history import History, history_of
-from tpcd.belief.likelihood import HistoryLikelihood, Threshold, history_likelihood
-from tpcd.belief.misfit import MisfitField
-from tpcd.belief.prior import ParameterPrior, make_prior
-from tpcd.belief.smc import (
+from tpcd.belief.cloud import (
     Cloud,
     CloudInfo,
     SamplerSettings,
-    assimilate,
     cloud_from_tensors,
     cloud_to_tensors,
     start_cloud,
 )
+from tpcd.belief.history import History, history_of
+from tpcd.belief.likelihood import HistoryLikelihood, Threshold, history_likelihood
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.belief.smc import assimilate
 from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters

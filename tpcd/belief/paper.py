@@ -36,6 +36,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.belief import Belief, EstimationStep
+from tpcd.belief.cloud import CloudInfo
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.resampling import (
@@ -43,7 +44,6 @@ from tpcd.belief.resampling import (
     normalise_log_weights,
     systematic_resample,
 )
-from tpcd.belief.smc import CloudInfo
 from tpcd.belief.state import EstimatorState
 from tpcd.contact import column_scene, scene_from_parameters
 from tpcd.data.episode import Episode

@@ -33,7 +33,7 @@ def test_innovations_and_field_equal_those_of_one_dense_normal_distribution() ->
     for k in range(n):
         # The model starts where the filter says, not where the reading was.
         moved = (from_start[:, k] @ state.mean[:, c:, None])[..., 0]
-        state, gain = assimilate(
+        state, found = assimilate(
             state,
             residual[:, k] + moved,
             rows[:, k],
@@ -41,7 +41,7 @@ def test_innovations_and_field_equal_those_of_one_dense_normal_distribution() ->
             variance[k + 1],
             uncovered[:, k],
         )
-        total = total + gain
+        total = total + found.log_density
     for i in range(m):
         errors = torch.zeros(3 * n, 3 * (n + 1), dtype=torch.float64)
         for k in range(n):
@@ -70,10 +70,10 @@ def one_residual(distance: float, rows: Tensor) -> tuple[Tensor, Tensor]:
     state = first_state(torch.ones(1, dtype=torch.float64), rows.shape[-1], torch.ones(3).double())
     residual = torch.tensor([[distance, 0.0, 0.0]], dtype=torch.float64)
     zeros = torch.zeros(1, 3, 3, dtype=torch.float64)
-    state, density = assimilate(
+    state, found = assimilate(
         state, residual, rows, zeros, torch.ones(3, dtype=torch.float64), zeros
     )
-    return density, state.mean
+    return found.log_density, state.mean
 
 
 def test_log_likelihood_of_an_outlier_falls_with_the_logarithm_of_its_distance() -> None:

@@ -1,4 +1,4 @@
-"""The Student mixture: density, sampling and fit."""
+"""The Student mixture: density, sampling, and components from the curvature of a target."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import multivariate_t
 
-from tpcd.belief.proposals import DEGREES_OF_FREEDOM, StudentMixture, fit_student_mixture
+from tpcd.belief.proposals import DEGREES_OF_FREEDOM, StudentMixture, newton_mixture
 
 
 def two_components(dimension: int) -> StudentMixture:
@@ -15,7 +15,7 @@ def two_components(dimension: int) -> StudentMixture:
     factor = torch.randn(2, dimension, dimension, generator=generator, dtype=torch.float64).tril()
     factor.diagonal(dim1=-2, dim2=-1).abs_().add_(0.4)
     mean = torch.randn(2, dimension, generator=generator, dtype=torch.float64)
-    return StudentMixture(torch.tensor([0.3, 0.7], dtype=torch.float64).log(), mean, factor)
+    return StudentMixture(mean, factor)
 
 
 def test_density_is_that_of_scipy() -> None:
@@ -23,10 +23,8 @@ def test_density_is_that_of_scipy() -> None:
     points = 2 * torch.randn(50, 3, generator=torch.Generator().manual_seed(1)).double()
     scales = (mixture.factor @ mixture.factor.mT).numpy()
     expected = sum(
-        float(share) * multivariate_t(mean, scale, df=DEGREES_OF_FREEDOM).pdf(points.numpy())
-        for share, mean, scale in zip(
-            mixture.log_share.exp(), mixture.mean.numpy(), scales, strict=True
-        )
+        0.5 * multivariate_t(mean, scale, df=DEGREES_OF_FREEDOM).pdf(points.numpy())
+        for mean, scale in zip(mixture.mean.numpy(), scales, strict=True)
     )
     np.testing.assert_allclose(mixture.log_density(points).exp().numpy(), expected, rtol=1e-10)
 
@@ -41,36 +39,48 @@ def test_density_integrates_to_one() -> None:
 def test_draws_have_the_density_they_are_said_to_have() -> None:
     """The mean of p / q over draws of q is 1 for any normalised p: here a shifted mixture."""
     mixture = two_components(2)
-    other = StudentMixture(mixture.log_share, mixture.mean + 0.3, mixture.factor)
+    other = StudentMixture(mixture.mean + 0.3, mixture.factor)
     draws = mixture.sample(40_000, torch.Generator().manual_seed(2))
     ratio = (other.log_density(draws) - mixture.log_density(draws)).exp()
     error = float(ratio.std()) / 200
     assert abs(float(ratio.mean()) - 1) < 4 * error
 
 
-def test_the_fit_finds_two_separate_groups_and_heeds_weights() -> None:
-    generator = torch.Generator().manual_seed(3)
-    points = torch.randn(2000, 2, generator=generator, dtype=torch.float64)
-    points[1000:] += 10.0
-    weights = torch.ones(2000, dtype=torch.float64)
-    weights[1000:] = 3.0
-    # Started at random particles, a fit can miss a group; most starts find both.
-    found = []
-    for seed in range(6):
-        start = torch.Generator().manual_seed(seed)
-        mixture = fit_student_mixture(points, weights / weights.sum(), 2, start, rounds=30)
-        order = mixture.mean[:, 0].argsort()
-        centre = torch.tensor([[0.0, 0.0], [10.0, 10.0]], dtype=torch.float64)
-        close = (mixture.mean[order] - centre).abs().max() < 0.3
-        share = mixture.log_share.exp()[order][1]
-        found.append(bool(close) and abs(float(share) - 0.75) < 0.05)
-    assert sum(found) >= 2
+def test_joined_mixtures_weigh_all_components_alike() -> None:
+    mixture = two_components(2)
+    other = StudentMixture(mixture.mean[:1] + 2.0, mixture.factor[:1])
+    points = torch.randn(30, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    joined = StudentMixture.joined([mixture, other])
+    expected = (2 * mixture.log_density(points).exp() + other.log_density(points).exp()) / 3
+    torch.testing.assert_close(joined.log_density(points).exp(), expected)
 
 
-@pytest.mark.parametrize("copies", [1, 2])
-def test_a_fit_to_one_or_two_different_points_stays_finite(copies: int) -> None:
-    points = torch.arange(copies, dtype=torch.float64).repeat(50)[:, None].expand(-1, 3)
-    weights = torch.full((len(points),), 1 / len(points), dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    mixture = fit_student_mixture(points.contiguous(), weights, 3, generator)
-    assert torch.isfinite(mixture.log_density(mixture.sample(20, generator))).all()
+def normal_target(dimension: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and information of a normal target."""
+    generator = torch.Generator().manual_seed(5)
+    root = torch.randn(dimension, dimension, generator=generator, dtype=torch.float64)
+    mean = torch.randn(dimension, generator=generator, dtype=torch.float64)
+    return mean, root @ root.T + torch.eye(dimension, dtype=torch.float64)
+
+
+def test_a_whole_newton_step_from_anywhere_gives_a_normal_target_itself() -> None:
+    mean, information = normal_target(3)
+    points = 3 * torch.randn(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    gradient = (mean - points) @ information
+    mixture = newton_mixture(points, gradient, information.expand(6, 3, 3), share=1.0)
+    torch.testing.assert_close(mixture.mean, mean.expand(6, 3))
+    covariance = mixture.factor @ mixture.factor.mT
+    torch.testing.assert_close(covariance, torch.linalg.inv(information).expand(6, 3, 3))
+
+
+def test_components_at_draws_of_a_normal_target_have_its_mean_and_covariance() -> None:
+    """For any share of the step: the mixture of 20,000 components keeps both moments."""
+    mean, information = normal_target(2)
+    covariance = torch.linalg.inv(information)
+    normal = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(1)).double()
+    points = mean + normal @ torch.linalg.cholesky(covariance).T
+    gradient = (mean - points) @ information
+    mixture = newton_mixture(points, gradient, information.expand(20_000, 2, 2), share=0.4)
+    torch.testing.assert_close(mixture.mean.mean(0), mean, atol=0.02, rtol=0)
+    within = (mixture.factor @ mixture.factor.mT)[0]
+    torch.testing.assert_close(within + torch.cov(mixture.mean.T), covariance, atol=0.02, rtol=0)

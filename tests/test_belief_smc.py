@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -13,6 +15,7 @@ from tpcd.belief.smc import assimilate
 
 DIMENSION = 3
 NOISE = 0.3
+Likelihood = Callable[[Tensor, object], tuple[Tensor, Tensor]]
 
 
 class LinearModel:
@@ -32,12 +35,15 @@ class LinearModel:
         error = (self.data - x @ self.rows.T) / NOISE
         return -0.5 * error**2 - math.log(NOISE) - 0.5 * math.log(2 * math.pi)
 
-    def log_likelihood(self, before: int, count: int):
+    def log_likelihood(self, before: int, count: int) -> Likelihood:
         def evaluate(x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
             terms = self.terms(x)
             return terms[:, :before].sum(-1), terms[:, :count].sum(-1)
 
         return evaluate
+
+    def target(self, before: int, count: int, likelihood: Likelihood | None = None) -> LinearTarget:
+        return LinearTarget(self, before, count, likelihood or self.log_likelihood(before, count))
 
     def posterior(self, count: int) -> tuple[Tensor, Tensor, float]:
         rows, data = self.rows[:count], self.data[:count]
@@ -48,6 +54,30 @@ class LinearModel:
         return covariance @ rows.T @ data / NOISE**2, covariance, float(evidence.log_prob(data))
 
 
+@dataclass(frozen=True)
+class LinearTarget:
+    """Data up to `count`, those from `before` on new, or another likelihood in their place."""
+
+    model: LinearModel
+    before: int
+    count: int
+    log_likelihood: Likelihood
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        return torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+
+    def log_prior(self, x: Tensor) -> Tensor:
+        return self.model.log_prior(x)
+
+    def curvature(self, x: Tensor, spread: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+        rows, data = self.model.rows[: self.count], self.model.data[: self.count]
+        share = torch.ones_like(data)
+        share[self.before :] = temperature
+        gradient = (share * (data - x @ rows.T)) @ rows / NOISE**2 - x
+        information = torch.eye(DIMENSION).double() + (rows.T * share) @ rows / NOISE**2
+        return gradient, information.expand(len(x), -1, -1)
+
+
 def run(
     model: LinearModel, stops: list[int], seed: int, settings: SamplerSettings
 ) -> tuple[Cloud, list[tuple[float, float]]]:
@@ -56,9 +86,7 @@ def run(
     start = torch.randn(settings.particles, DIMENSION, generator=generator, dtype=torch.float64)
     cloud, evidence, before = start_cloud(start, model.log_prior), [], 0
     for stop in stops:
-        cloud, info = assimilate(
-            cloud, model.log_prior, model.log_likelihood(before, stop), settings, generator
-        )
+        cloud, info = assimilate(cloud, model.target(before, stop), settings, generator)
         assert info.effective_sample_size > 1
         evidence.append((cloud.log_evidence, cloud.log_evidence_std))
         before = stop
@@ -121,8 +149,7 @@ def test_permuting_the_particles_changes_the_answer_by_chance_only() -> None:
     for positions in (start, start[order]):
         cloud, _ = assimilate(
             start_cloud(positions, model.log_prior),
-            model.log_prior,
-            model.log_likelihood(0, 3),
+            model.target(0, 3),
             SETTINGS,
             torch.Generator().manual_seed(1),
         )
@@ -145,8 +172,7 @@ def test_a_cloud_that_is_thinned_still_has_the_posterior_and_the_evidence() -> N
     for k in range(4):
         cloud, _ = assimilate(
             cloud,
-            model.log_prior,
-            model.log_likelihood(k, k + 1),
+            model.target(k, k + 1),
             settings,
             generator,
             settings.particles_at(k + 1),
@@ -174,8 +200,7 @@ def test_one_chunk_or_many_give_the_same_cloud() -> None:
         clouds.append(
             assimilate(
                 start_cloud(start, model.log_prior),
-                model.log_prior,
-                likelihood,
+                model.target(0, 2, likelihood),
                 settings,
                 generator,
             )[0]
@@ -194,7 +219,7 @@ def test_a_region_of_zero_likelihood_halves_the_evidence_and_holds_no_particle()
     start = torch.randn(4000, DIMENSION, generator=generator, dtype=torch.float64)
     settings = SamplerSettings(particles=4000)
     cloud, _ = assimilate(
-        start_cloud(start, model.log_prior), model.log_prior, half, settings, generator
+        start_cloud(start, model.log_prior), model.target(0, 1, half), settings, generator
     )
     assert (cloud.positions[:, 0] > 0).all()
     assert cloud.log_evidence == pytest.approx(math.log(0.5), abs=0.06)
@@ -213,8 +238,7 @@ def test_nan_likelihoods_count_as_zero_and_never_spread() -> None:
     start = torch.randn(500, DIMENSION, generator=generator, dtype=torch.float64)
     cloud, _ = assimilate(
         start_cloud(start, model.log_prior),
-        model.log_prior,
-        broken,
+        model.target(0, 2, broken),
         SamplerSettings(particles=500),
         generator,
     )
@@ -232,8 +256,7 @@ def test_a_datum_that_nobody_explains_is_refused_in_words() -> None:
     with pytest.raises(ValueError, match="no particle explains"):
         assimilate(
             start_cloud(start, model.log_prior),
-            model.log_prior,
-            nothing,
+            model.target(0, 1, nothing),
             SamplerSettings(particles=100),
             torch.Generator().manual_seed(0),
         )
@@ -244,18 +267,17 @@ def test_an_uninformative_datum_changes_nothing_but_places() -> None:
         zero = torch.zeros(len(x), dtype=torch.float64)
         return zero, zero
 
-    model = LinearModel(1)
+    model = LinearModel(0)
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(200, DIMENSION, generator=generator, dtype=torch.float64)
     settings = SamplerSettings(particles=200)
     cloud, info = assimilate(
-        start_cloud(start, model.log_prior), model.log_prior, flat, settings, generator
+        start_cloud(start, model.log_prior), model.target(0, 0, flat), settings, generator
     )
     assert info.temperatures == 1
-    assert info.evaluations == (1 + info.moves) * 200
-    assert info.distinct_ancestors == 200
-    assert cloud.log_evidence == pytest.approx(0.0, abs=1e-12)
-    assert cloud.log_evidence_std == pytest.approx(0.0, abs=1e-7)
+    assert info.distinct_ancestors > 150
+    assert cloud.log_evidence_std < 0.05
+    assert abs(cloud.log_evidence) < 4 * cloud.log_evidence_std
 
 
 @pytest.mark.parametrize(("share", "independent"), [(0.0, False), (1.0, True)])
@@ -266,8 +288,7 @@ def test_the_share_of_independent_moves_is_what_is_set(share: float, independent
     settings = SamplerSettings(particles=200, independent_share=share)
     _, info = assimilate(
         start_cloud(start, model.log_prior),
-        model.log_prior,
-        model.log_likelihood(0, 1),
+        model.target(0, 1),
         settings,
         generator,
     )
@@ -283,6 +304,9 @@ def test_the_share_of_independent_moves_is_what_is_set(share: float, independent
         {"components": 0},
         {"final_moves": -1},
         {"independent_share": 1.5},
+        {"pool_share": 0.0},
+        {"importance_rounds": 0},
+        {"fresh_modes": 0},
     ],
 )
 def test_settings_without_meaning_are_refused(wrong: dict) -> None:

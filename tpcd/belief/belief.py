@@ -7,7 +7,6 @@ posterior of the outline misfit; it is all that prediction needs besides the sha
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -24,12 +23,12 @@ from tpcd.belief.cloud import (
     cloud_to_tensors,
     start_cloud,
 )
-from tpcd.belief.history import History, history_of
-from tpcd.belief.likelihood import HistoryLikelihood, Threshold, history_likelihood
+from tpcd.belief.history import history_of
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.smc import assimilate
 from tpcd.belief.state import EstimatorState
+from tpcd.belief.target import ContactTarget, contact_target
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
@@ -124,31 +123,24 @@ def estimate(
     prior = make_prior(shape, episode.priors)
     history = history_of(episode)
     misfit = misfit_field(shape, settings)
-    model = _Model(prior, misfit, settings.step)
+    target = contact_target(prior, misfit, settings.step)
     if state is None:
         count = settings.sampler.particles_at(1)
-        cloud = start_cloud(model.sample(count, generator), model.log_prior)
+        cloud = start_cloud(target.sample(count, generator), target.log_prior)
     else:
         cloud = cloud_from_tensors(state.restore(generator))
     for k in range(1 if state is None else state.index + 1, len(history) + 1):
         started = time.perf_counter()
-        so_far = history.first(k)
-
-        def log_likelihood(
-            score: Tensor, threshold: Threshold | None, so_far: History = so_far
-        ) -> tuple[Tensor, Tensor]:
-            found = model.evaluate(score, so_far, threshold)
-            return found.before, found.total
+        target = target.given(history.first(k))
 
         cloud, info = assimilate(
             cloud,
-            model.log_prior,
-            log_likelihood,
+            target,
             settings.sampler,
             generator,
             settings.sampler.particles_at(k),
         )
-        belief = model.belief(cloud, so_far)
+        belief = _belief(cloud, target)
         seconds = time.perf_counter() - started
         after = EstimatorState(k, cloud_to_tensors(cloud), generator.get_state())
         yield EstimationStep(k, belief, info, seconds, after)
@@ -174,49 +166,19 @@ def weighted_quantile(
     return ordered.gather(0, first[None])[0]
 
 
-@dataclass(frozen=True)
-class _Model:
-    """What the sampler moves in: the scores of theta and, last, of the size of the misfit."""
-
-    prior: ParameterPrior
-    misfit: MisfitField
-    step: StepSettings
-
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        score = self.prior.sample(count, generator)
-        misfit = torch.randn(count, 1, generator=generator, dtype=torch.float64)
-        return torch.cat((score, misfit), dim=-1)
-
-    def log_prior(self, score: Tensor) -> Tensor:
-        normal = -0.5 * score[:, -1] ** 2 - 0.5 * math.log(2 * math.pi)
-        return self.prior.log_density(score[:, :-1]) + normal
-
-    def evaluate(
-        self, score: Tensor, history: History, threshold: Threshold | None = None
-    ) -> HistoryLikelihood:
-        return history_likelihood(
-            self.prior.shape,
-            self.prior.to_parameters(score[:, :-1]),
-            self.misfit.sd_of(score[:, -1]),
-            history,
-            self.misfit,
-            self.step,
-            threshold,
-        )
-
-    def belief(self, cloud: Cloud, history: History) -> Belief:
-        found = self.evaluate(cloud.positions, history)
-        count = len(cloud.positions)
-        return Belief(
-            prior=self.prior,
-            vectors=self.prior.to_vector(cloud.positions[:, :-1]),
-            weights=torch.full((count,), 1.0 / count, dtype=torch.float64),
-            misfit=self.misfit,
-            misfit_sd=self.misfit.sd_of(cloud.positions[:, -1]),
-            misfit_mean=found.field_mean,
-            misfit_covariance=found.field_covariance,
-            step=self.step,
-            stiffness=history.stiffness,
-            log_evidence=cloud.log_evidence,
-            log_evidence_std=cloud.log_evidence_std,
-        )
+def _belief(cloud: Cloud, target: ContactTarget) -> Belief:
+    found = target.evaluate(cloud.positions)
+    count = len(cloud.positions)
+    return Belief(
+        prior=target.prior,
+        vectors=target.prior.to_vector(cloud.positions[:, :-1]),
+        weights=torch.full((count,), 1.0 / count, dtype=torch.float64),
+        misfit=target.misfit,
+        misfit_sd=target.misfit.sd_of(cloud.positions[:, -1]),
+        misfit_mean=found.field_mean,
+        misfit_covariance=found.field_covariance,
+        step=target.step,
+        stiffness=target.history.stiffness,
+        log_evidence=cloud.log_evidence,
+        log_evidence_std=cloud.log_evidence_std,
+    )

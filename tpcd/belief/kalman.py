@@ -41,6 +41,21 @@ class FieldState:
     covariance: Float[Tensor, "m s s"]
 
 
+@dataclass(frozen=True)
+class Innovation:
+    """What a transition brings that was not known before, in independent standard units."""
+
+    whitened: Float[Tensor, "m 3"]
+    log_scale: Float[Tensor, "m 3"]
+    """Logarithm of the units [log m, log m, log rad]."""
+
+    @property
+    def log_density(self) -> Float[Tensor, " m"]:
+        """Log density of the transition's residual given those before."""
+        each = 0.5 * self.whitened**2 + self.log_scale + 0.5 * math.log(2 * math.pi)
+        return -each.sum(-1)
+
+
 def first_state(
     sd: Float[Tensor, " m"], coefficients: int, variance: Float[Tensor, " 3"]
 ) -> FieldState:
@@ -57,9 +72,8 @@ def assimilate(
     from_start: Float[Tensor, "m 3 3"],
     variance: Float[Tensor, " 3"],
     uncovered: Float[Tensor, "m 3 3"],
-) -> tuple[FieldState, Float[Tensor, " m"]]:
-    """The state after a transition that started at the filtered pose, and the log density of
-    its residual given those before."""
+) -> tuple[FieldState, Innovation]:
+    """The state after a transition that started at the filtered pose, and its innovation."""
     count = rows.shape[-1]
     design = torch.cat((rows, -from_start), dim=-1)
     cross = state.covariance @ design.mT
@@ -71,8 +85,7 @@ def assimilate(
     growth = (square / OUTLIER_SQUARE).clamp_min(1.0)
     # Growing the covariance by a number stretches its factor by the root.
     factor, whitened = factor * growth.sqrt()[:, None, None], whitened / growth.sqrt()[:, None]
-    log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    log_density = -0.5 * square / growth - 0.5 * log_determinant - 1.5 * math.log(2 * math.pi)
+    found = Innovation(whitened, factor.diagonal(dim1=-2, dim2=-1).log())
     # The next state: the field goes on, the error of this pose takes the place of the last.
     answer = torch.cat((cross[:, :count], noise.expand_as(covariance)), dim=1)
     gain = torch.linalg.solve_triangular(factor, answer.mT, upper=False).mT
@@ -81,7 +94,7 @@ def assimilate(
     before[:, :count, :count] = state.covariance[:, :count, :count]
     before[:, count:, count:] = noise
     mean = keep + (gain @ whitened[..., None])[..., 0]
-    return FieldState(mean, before - gain @ gain.mT), log_density
+    return FieldState(mean, before - gain @ gain.mT), found
 
 
 def _whiten(covariance: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:

@@ -43,17 +43,26 @@ class Measured(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Where the answers go: log likelihoods (m), field mean (m, c) and covariance (m, c, c)."""
+    """Where the answers go: log likelihoods (m), field mean (m, c) and covariance (m, c, c),
+    innovations and the logarithms of their units (m, n, 3) where they are asked for (else m = 0),
+    and derivatives (m, d, n, 3) of the innovations by d entries of theta.
+    """
 
     total: np.ndarray
     before: np.ndarray
     mean: np.ndarray
     covariance: np.ndarray
     jammed: np.ndarray
+    whitened: np.ndarray
+    log_scale: np.ndarray
+    slopes: np.ndarray
 
 
 class Filter(NamedTuple):
-    """The state of one particle's filter and what one transition needs; s = c + 3."""
+    """The state of one particle's filter and what one transition needs; s = c + 3.
+
+    `by_theta` (d, s) are the derivatives of the mean.
+    """
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -61,6 +70,7 @@ class Filter(NamedTuple):
     cross: np.ndarray
     factor: np.ndarray
     innovation: np.ndarray
+    by_theta: np.ndarray
 
 
 def _compile_explain_range(stamp: int) -> Callable[..., None]:
@@ -68,20 +78,22 @@ def _compile_explain_range(stamp: int) -> Callable[..., None]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     @no_type_check
-    def explain_range(world, law, request, measured, found, first, last):
+    def explain_range(world, law, request, measured, by_theta, found, first, last):
         if stamp >= 0:
-            _explain_range(world, law, request, measured, found, first, last)
+            _explain_range(world, law, request, measured, by_theta, found, first, last)
 
     return explain_range
 
 
 @njit(nogil=True, error_model="numpy")
 @no_type_check
-def _explain_range(world, law, request, measured, found, first, last):
+def _explain_range(world, law, request, measured, by_theta, found, first, last):
     """Evaluate the particles from `first` up to `last`."""
     terrains, count = world.normals.shape[1], world.points.shape[2]
     steps, size = measured.rest.shape[0], found.mean.shape[1]
-    chains, space, slopes = new_chains(terrains, count), new_space(terrains), new_slopes(terrains)
+    entries = by_theta.offsets.shape[1]
+    chains, space = new_chains(terrains, count), new_space(terrains)
+    slopes = new_slopes(terrains, entries)
     poses = np.zeros((7, 3))
     answer = Answer(
         np.zeros((steps, 3)),
@@ -99,6 +111,7 @@ def _explain_range(world, law, request, measured, found, first, last):
         np.zeros((size + 3, 3)),
         np.zeros((3, 3)),
         np.zeros(3),
+        np.zeros((entries, size + 3)),
     )
     # Each particle starts its transitions at poses of its own.
     starts = request.starts.copy()
@@ -121,12 +134,19 @@ def _explain_range(world, law, request, measured, found, first, last):
         for k in range(steps):
             for a in range(3):
                 starts[k, a] = measured.poses[k, a] - state.mean[size + a]
-            step_element(world, i, chains, law, extent, request, k, answer, space, slopes, poses)
+            step_element(
+                world, i, chains, law, extent, request, k, answer, space, slopes, poses, by_theta
+            )
             if answer.statuses[k] == RELAXED:
                 found.jammed[i] = True
                 break
             before = total
             total += _assimilate(state, measured, answer, k, measured.sd[i])
+            if found.whitened.shape[0] > 0 and math.isfinite(total):
+                for a in range(3):
+                    found.whitened[i, k, a] = state.innovation[a]
+                    found.log_scale[i, k, a] = math.log(state.factor[a, a])
+                _follow(state, slopes.theta, found.slopes, i, k, size)
             share = measured.temperature if k == steps - 1 else 1.0
             reach = before + share * (total - before) + measured.rest[k]
             if not (reach >= measured.least[i] and math.isfinite(total)):
@@ -146,6 +166,7 @@ def _explain_range(world, law, request, measured, found, first, last):
 def _begin(state, measured, sd):
     """The state before any transition."""
     width = state.mean.shape[0]
+    state.by_theta[:] = 0.0
     for a in range(width):
         state.mean[a] = 0.0
         for b in range(width):
@@ -253,6 +274,29 @@ def _advance(state, variance, k, size):
 
 @njit(_nrt=False)
 @no_type_check
+def _follow(state, theta, slopes, i, k, size):
+    """Derivatives of the innovation and of the mean by theta, at a fixed gain (Gauss-Newton).
+
+    `theta` are those of the settled pose from a given start; after `_assimilate`.
+    """
+    by_theta, factor, gain = state.by_theta, state.factor, state.cross
+    for e in range(theta.shape[0]):
+        for a in range(3):
+            value = -theta[e, a]
+            for r in range(size + 3):
+                value -= state.design[a, r] * by_theta[e, r]
+            for b in range(a):
+                value -= factor[a, b] * slopes[i, e, k, b]
+            slopes[i, e, k, a] = value / factor[a, a]
+        for r in range(size + 3):
+            value = by_theta[e, r] if r < size else 0.0
+            for a in range(3):
+                value += gain[r, a] * slopes[i, e, k, a]
+            by_theta[e, r] = value
+
+
+@njit(_nrt=False)
+@no_type_check
 def _factorise(matrix):
     """Cholesky factor in the lower triangle, in place; returns the log determinant."""
     result = 0.0
@@ -281,7 +325,8 @@ def _forward(factor, vector):
 
 
 explain_range = _compile_explain_range(source_stamp(sys.modules[__name__]))
-"""Evaluate particles `first` up to `last`: (world, law, request, measured, found, first, last).
+"""Evaluate particles `first` up to `last`: (world, law, request, measured, by_theta, found,
+first, last).
 
 Fills their part of `found` in place and releases the interpreter lock meanwhile.
 """

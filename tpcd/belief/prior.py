@@ -57,6 +57,13 @@ class ParameterPrior:
         place = torch.special.ndtr(score).clamp(_EDGE, 1 - _EDGE)
         return self.low + (self.high - self.low) * place
 
+    def to_vector_with_slope(
+        self, score: Float[Tensor, "*batch d"]
+    ) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d"]]:
+        """Theta, and the derivative of each entry by its own coordinate."""
+        density = torch.exp(-0.5 * score**2) / math.sqrt(2 * math.pi)
+        return self.to_vector(score), (self.high - self.low) * density
+
     def to_parameters(self, score: Float[Tensor, "*batch d"]) -> Parameters:
         """Theta as named tensors from unconstrained coordinates."""
         return Parameters.from_vector(self.to_vector(score))

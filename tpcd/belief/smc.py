@@ -15,30 +15,25 @@ linear-normal model with known answers in the tests.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import Cloud, CloudInfo, LogDensity, SamplerSettings
+from tpcd.belief.cloud import Cloud, CloudInfo, SamplerSettings, Target
+from tpcd.belief.importance import Pool, draw_pool, exchange
 from tpcd.belief.likelihood import Threshold
-from tpcd.belief.proposals import StudentMixture, fit_student_mixture
+from tpcd.belief.proposals import StudentMixture, newton_mixture
 from tpcd.belief.resampling import (
     effective_sample_size,
     normalise_log_weights,
     systematic_resample,
 )
 
-LogLikelihood = Callable[[Tensor, Threshold | None], tuple[Tensor, Tensor]]
-"""Coordinates (m, d) to log likelihood (m) of the history before and with the new datum; a
-particle that stays below its threshold may get -inf for both."""
-
 
 def assimilate(
     cloud: Cloud,
-    log_prior: LogDensity,
-    log_likelihood: LogLikelihood,
+    target: Target,
     settings: SamplerSettings,
     generator: torch.Generator,
     count: int | None = None,
@@ -47,10 +42,10 @@ def assimilate(
 
     Raises ValueError where no particle can explain the datum at all.
     """
-    state = _State(cloud, *log_likelihood(cloud.positions, None))
+    cloud = replace(cloud, ancestor=torch.arange(len(cloud.positions)))
+    state = _State(cloud, *target.log_likelihood(cloud.positions, None))
     tally = _Tally(evaluations=len(cloud.positions))
     temperature, smallest = 0.0, float(len(cloud.positions))
-    mixture = cloud.mixture
     while temperature < 1.0:
         gain = state.with_datum - state.before
         gain = torch.where(torch.isfinite(gain), gain, -torch.inf)
@@ -59,24 +54,18 @@ def assimilate(
         weights = normalise_log_weights(log_weights)
         smallest = min(smallest, effective_sample_size(weights))
         state = state.weighted(log_weights, weights)
-        mixture = _fit(state.cloud.positions, weights, settings, generator, mixture)
         state = state.take(systematic_resample(weights, count or len(weights), generator))
         temperature += advance
-        last = temperature >= 1.0
-        state, mixture = _move(
-            state,
-            mixture,
-            temperature,
-            last,
-            log_prior,
-            log_likelihood,
-            settings,
-            generator,
-            tally,
-        )
         tally.temperatures += 1
-    cloud = replace(state.cloud, log_likelihood=state.with_datum, mixture=mixture)
-    cloud = replace(cloud, log_evidence_std=_evidence_std(cloud.ancestor))
+        if temperature < 1.0:
+            mixture = _fit(state.cloud.positions, target, temperature, settings, generator)
+            moves = settings.tempering_moves
+            state = _move(state, mixture, moves, temperature, target, settings, generator, tally)
+    pool = draw_pool(target, state.cloud.positions, state.cloud.modes, settings, generator)
+    tally.evaluations += pool.evaluations
+    state = _exchange(state, pool, settings, generator)
+    state = _move(state, pool.last, settings.final_moves, 1.0, target, settings, generator, tally)
+    cloud = replace(state.cloud, log_likelihood=state.with_datum)
     info = CloudInfo(
         temperatures=tally.temperatures,
         moves=tally.moves,
@@ -156,59 +145,69 @@ def _next_temperature(gain: Tensor, temperature: float, kept_share: float) -> fl
     return temperature + max(low, 1e-12)
 
 
-def _fit(
-    positions: Tensor,
-    weights: Tensor,
-    settings: SamplerSettings,
-    generator: torch.Generator,
-    before: StudentMixture | None,
-) -> StudentMixture:
-    """The mixture of the cloud; from the one before it takes a few rounds only."""
-    rounds = 30 if before is None else 6
-    if len(positions) > settings.particles:
-        chosen = systematic_resample(weights, settings.particles, generator)
-        positions = positions[chosen]
-        weights = torch.full_like(weights[chosen], 1.0 / len(chosen))
-    return fit_student_mixture(
-        positions, weights, settings.components, generator, rounds, start=before
+def _exchange(
+    state: _State, pool: Pool, settings: SamplerSettings, generator: torch.Generator
+) -> _State:
+    """Particles choose between themselves and the pool, which also knows the evidence."""
+    cloud = state.cloud
+    weights = cloud.log_prior + state.with_datum - pool.mixture.log_density(cloud.positions)
+    leaves, index = exchange(weights, pool.log_weights, settings.pool_share, generator)
+    draws, count = pool.draws, len(cloud.positions)
+    cloud = replace(
+        cloud,
+        positions=torch.where(leaves[:, None], draws.positions[index], cloud.positions),
+        log_prior=torch.where(leaves, draws.log_prior[index], cloud.log_prior),
+        ancestor=torch.where(leaves, count + index, cloud.ancestor),
+        modes=pool.modes,
+        log_evidence=pool.log_evidence,
+        log_evidence_std=pool.log_evidence_std,
+    )
+    return _State(
+        cloud,
+        torch.where(leaves, draws.before[index], state.before),
+        torch.where(leaves, draws.with_datum[index], state.with_datum),
     )
 
 
 def _move(
     state: _State,
     mixture: StudentMixture,
+    moves: int,
     temperature: float,
-    last: bool,
-    log_prior: LogDensity,
-    log_likelihood: LogLikelihood,
+    target: Target,
     settings: SamplerSettings,
     generator: torch.Generator,
     tally: _Tally,
-) -> tuple[_State, StudentMixture]:
+) -> _State:
     """Metropolis-Hastings moves that leave the tempered posterior invariant."""
-    even = torch.full_like(state.before, 1.0 / len(state.before))
-    spread = torch.linalg.cholesky(_covariance(state.cloud.positions))
     share_independent = settings.independent_share
-    for move in range(settings.final_moves if last else settings.tempering_moves):
-        if move > 0 and move % settings.moves_per_fit == 0:
-            mixture = _fit(state.cloud.positions, even, settings, generator, mixture)
+    of_here = mixture.log_densities(state.cloud.positions)
+    for move in range(moves):
+        here = state.cloud.positions
         # Independent moves come due at their share of all moves so far, the first one first.
         due = math.ceil((move + 1) * share_independent) - math.ceil(move * share_independent)
         independent = due > 0
-        here = state.cloud.positions
         if independent:
             proposal = mixture.sample(len(here), generator)
-            correction = mixture.log_density(here) - mixture.log_density(proposal)
+            of_there = mixture.log_densities(proposal)
+            correction = torch.logsumexp(of_here, -1) - torch.logsumexp(of_there, -1)
         else:
+            # A step in the shape of a component, drawn by what it has to do with the place.
+            component = torch.multinomial(of_here.softmax(-1), 1, generator=generator)
             noise = torch.randn(here.shape, generator=generator, dtype=here.dtype)
-            proposal = here + state.cloud.step_scale * noise @ spread.T
-            correction = torch.zeros_like(state.before)
-        prior = log_prior(proposal)
+            step = mixture.stretch(component[:, 0], noise)
+            proposal = here + state.cloud.step_scale * step
+            of_there = mixture.log_densities(proposal)
+            there, back = (
+                v.log_softmax(-1).gather(1, component)[:, 0] for v in (of_here, of_there)
+            )
+            correction = back - there
+        prior = target.log_prior(proposal)
         old = state.cloud.log_prior + state.before + temperature * (state.with_datum - state.before)
         uniform = torch.rand(len(here), generator=generator, dtype=torch.float64)
         least = uniform.log() + old - correction - prior
         least = torch.where(torch.isnan(least), torch.inf, least)
-        before, with_datum = log_likelihood(proposal, Threshold(least, temperature))
+        before, with_datum = target.log_likelihood(proposal, Threshold(least, temperature))
         # Below its threshold a proposal may come back as -inf, and -inf - -inf is no number.
         accepted = before + temperature * (with_datum - before) > least
         share = float(accepted.double().mean())
@@ -226,18 +225,21 @@ def _move(
             torch.where(accepted, before, state.before),
             torch.where(accepted, with_datum, state.with_datum),
         )
+        of_here = torch.where(accepted[:, None], of_there, of_here)
         tally.count("independent" if independent else "local", len(here), int(accepted.sum()))
-    return state, mixture
+    return state
 
 
-def _covariance(positions: Tensor) -> Tensor:
-    """Covariance of the cloud, kept away from singular."""
-    covariance = torch.cov(positions.T)
-    return covariance + 1e-6 * torch.diag(covariance.diagonal().clamp_min(1e-12))
-
-
-def _evidence_std(ancestor: Tensor) -> float:
-    """Standard error of the log evidence from the sizes of the families (Lee and Whiteley)."""
-    count = len(ancestor)
-    family = torch.bincount(ancestor, minlength=count).double() / count
-    return math.sqrt(max(float((family**2).sum()) - 1.0 / count, 0.0))
+def _fit(
+    positions: Tensor,
+    target: Target,
+    temperature: float,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> StudentMixture:
+    """Components at some of the particles."""
+    count = min(settings.at_most(settings.components), len(positions))
+    chosen = torch.randperm(len(positions), generator=generator)[:count]
+    points = positions[chosen]
+    gradient, information = target.curvature(points, positions.std(0), temperature)
+    return newton_mixture(points, gradient, information)

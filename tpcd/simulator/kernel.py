@@ -40,7 +40,9 @@ from tpcd.simulator.kernel_settle import (
     settle,
 )
 from tpcd.simulator.kernel_slopes import (
+    SceneSlopes,
     append_part,
+    append_theta,
     copy_rows,
     landing_response,
     new_slopes,
@@ -106,7 +108,10 @@ def _step_range(world, law, request, answer, first, last):
     """Step the transitions from `first` up to `last`."""
     terrains, count = world.normals.shape[1], world.points.shape[2]
     chains, space = new_chains(terrains, count), new_space(terrains)
-    slopes = new_slopes(terrains)
+    slopes = new_slopes(terrains, 0)
+    by_theta = SceneSlopes(
+        np.zeros((1, 0, 2, 1)), np.zeros((1, 0, terrains)), np.zeros((1, 0, terrains))
+    )
     poses = np.zeros((7, 3))
     b = first
     while b < last:
@@ -117,8 +122,9 @@ def _step_range(world, law, request, answer, first, last):
         extent = prepare(world, o, law, request, b, end, chains)
         for element in range(b, end):
             step_element(
-                world, o, chains, law, extent, request, element, answer, space, slopes, poses
-            )
+                world, o, chains, law, extent, request, element, answer, space, slopes, poses,
+                by_theta,
+            )  # fmt: skip
         b = end
 
 
@@ -185,8 +191,11 @@ def wrap(angle):
 
 @njit(nogil=True, error_model="numpy", _nrt=False)
 @no_type_check
-def step_element(world, o, chains, law, extent, request, b, answer, space, slopes, poses):
-    """One transition: rest on what was touched, go to the command, follow its path if need be."""
+def step_element(world, o, chains, law, extent, request, b, answer, space, slopes, poses, by_theta):
+    """One transition: rest on what was touched, go to the command, follow its path if need be.
+
+    Leaves the derivatives by theta, of a given start pose, in `slopes.theta`.
+    """
     start, before, command, part = poses[0], poses[1], poses[2], poses[3]
     landing, pose, kept_pose = poses[4], poses[5], poses[6]
     whole, terrains = slopes.whole, world.normals.shape[1]
@@ -205,6 +214,8 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
     before[2] = start[2] + wrap(before[2] - start[2])
     command[2] = start[2] + wrap(command[2] - start[2])
     whole[:] = 0.0
+    theta, entries = slopes.theta, slopes.theta.shape[0]
+    theta[:] = 0.0
     for a in range(3):
         pose[a] = start[a]
         whole[a, a] = 1.0
@@ -218,6 +229,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
     while run <= last:
         if run == 1:
             copy_rows(whole, 0, slopes.kept, height)
+            copy_rows(theta, 0, slopes.theta_kept, entries)
             for a in range(3):
                 kept_pose[a] = pose[a]
             share = 1.0
@@ -227,6 +239,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
             share = (run - 1) / substeps
         if run == 2:
             copy_rows(slopes.kept, 0, whole, height)
+            copy_rows(slopes.theta_kept, 0, theta, entries)
             for a in range(3):
                 pose[a] = kept_pose[a]
             status, residual = CONVERGED, 0.0
@@ -242,7 +255,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
             for a in range(3):
                 pose[a] = part[a]
                 space.chosen[a, 0] = -1
-            whole[:] = 0.0
+            whole[:], theta[:] = 0.0, 0.0
             for a in range(3):
                 whole[a, a] = follows
         else:
@@ -256,6 +269,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
             linear_system(world, o, law, part, pose, turn, space)
             settling_response(law, terrains, space, slopes)
             append_part(slopes, follows, space.force, space.right)
+            append_theta(world, o, law, by_theta, (point, terrain), landing, pose, space, slopes)
         if run == 0:
             touched, status, residual = _loaded(space), CONVERGED, 0.0
         elif run == 1 and substeps > 1:

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from tpcd.simulator.kernel_geometry import object_normal
+from tpcd.simulator.kernel_settle import respond
 
 GRAZING = 1e-9
 """Share of the way's motion towards a terrain below which a touch only grazes it."""
@@ -26,6 +27,7 @@ class Slopes(NamedTuple):
     `kept` a copy of it; `land` (6, 3) of the first touch by start and command, `land_gap`
     (t, 3) by gaps; `response` (6, 3) of one settling by start and command, `by_terrain`
     (2 t, 3) rows by gaps and by levers, `follow` and `yields` (3, 3) to get them with.
+    `theta` (d, 3) of the step so far by each entry of theta, `theta_kept` a copy of it.
     """
 
     whole: np.ndarray
@@ -36,11 +38,23 @@ class Slopes(NamedTuple):
     by_terrain: np.ndarray
     follow: np.ndarray
     yields: np.ndarray
+    theta: np.ndarray
+    theta_kept: np.ndarray
+
+
+class SceneSlopes(NamedTuple):
+    """How the scenes of the batch move with d entries of theta: points (.., d, 2, p) in the
+    end-effector frame, offsets and friction (.., d, t) of the terrains. d = 0 asks nothing.
+    """
+
+    points: np.ndarray
+    offsets: np.ndarray
+    friction: np.ndarray
 
 
 @njit
 @no_type_check
-def new_slopes(terrains):
+def new_slopes(terrains, entries):
     """Room for the derivatives of one element."""
     return Slopes(
         np.zeros((3 + 2 * terrains, 3)),
@@ -51,6 +65,8 @@ def new_slopes(terrains):
         np.zeros((2 * terrains, 3)),
         np.zeros((3, 3)),
         np.zeros((3, 3)),
+        np.zeros((entries, 3)),
+        np.zeros((entries, 3)),
     )
 
 
@@ -154,6 +170,59 @@ def append_part(slopes, follows, column, middle):
             for k in range(3):
                 value += response[a, k] * middle[k]
             whole[3 + r, a] = value
+
+
+@njit(_nrt=False)
+@no_type_check
+def append_theta(world, o, law, by_theta, touch, landing, pose, space, slopes):
+    """Append one settling to the derivatives of the whole step by theta.
+
+    `touch` is (point, terrain) of the first touch in the pose `landing`. At a given pose, an
+    entry of theta leaves a force on the balance and right-hand sides of the rows.
+    """
+    point, terrain = touch
+    land, response, theta = slopes.land, slopes.response, slopes.theta
+    start_turn = (math.cos(landing[2]), math.sin(landing[2]))
+    turn = (math.cos(pose[2]), math.sin(pose[2]))
+    for e in range(theta.shape[0]):
+        for a in range(3):
+            space.force[a] = space.right[a] = 0.0
+        for j in range(3):
+            if space.chosen[j, 0] < 0:
+                continue
+            p, t, k = space.chosen[j, 0], space.chosen[j, 1], space.chosen[j, 2]
+            nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+            u, v = object_normal(world, o, t, turn[0], turn[1])
+            u_start, v_start = object_normal(world, o, t, start_turn[0], start_turn[1])
+            x, z = by_theta.points[o, e, 0, p], by_theta.points[o, e, 1, p]
+            height, along = u * x + v * z, v * x - u * z
+            slope = space.side[j] * world.friction[o, t]
+            more = space.side[j] * by_theta.friction[o, e, t]
+            drag, more_drag = (0.0, 0.0) if law.coulomb and space.slipping[j] else (slope, more)
+            at_x, at_z = space.place[t, k, 0], space.place[t, k, 1]
+            slip = v * at_x - u * at_z + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
+            gap = height - by_theta.offsets[o, e, t]
+            space.right[j] = -(gap + drag * (along - (v_start * x - u_start * z)))
+            space.right[j] -= more_drag * slip
+            load = space.multiplier[j]
+            space.force[0] += load * more * nz
+            space.force[1] -= load * more * nx
+            space.force[2] += load * (along - slope * height - more * (u * at_x + v * at_z))
+        respond(space)
+        u, v = object_normal(world, o, terrain, start_turn[0], start_turn[1])
+        gap = u * by_theta.points[o, e, 0, point] + v * by_theta.points[o, e, 1, point]
+        gap -= by_theta.offsets[o, e, terrain]
+        for a in range(3):
+            space.force[a] = theta[e, a]
+        for a in range(3):
+            space.right[a] = gap * slopes.land_gap[terrain, a]
+            for k in range(3):
+                space.right[a] += land[a, k] * space.force[k]
+        for a in range(3):
+            value = space.change[a]
+            for k in range(3):
+                value += response[a, k] * space.right[k]
+            theta[e, a] = value
 
 
 @njit(_nrt=False)

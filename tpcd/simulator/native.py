@@ -68,18 +68,23 @@ def outlines(shape: Shape, parameters: Parameters) -> Float[Tensor, "m p 2"]:
 
     Records no gradient.
     """
-    theta = parameters.to_vector()
-    threads = min(thread_count(), math.ceil(len(theta) / CHUNK))
+    points = decode(shape, parameters.latent)
+    with torch.no_grad():
+        return place_points(points, parameters.scale, parameters.mount)
 
-    def part(vectors: Tensor) -> Tensor:
-        own = Parameters.from_vector(vectors)
+
+def decode(shape: Shape, latent: Float[Tensor, "m z"]) -> Float[Tensor, "m p 2"]:
+    """Outline points of m latents in the object frame [m], in the same threads, no gradient."""
+    threads = min(thread_count(), math.ceil(len(latent) / CHUNK))
+
+    def part(own: Tensor) -> Tensor:
         # Whether gradients are recorded is a setting of each thread.
         with torch.no_grad():
-            return place_points(shape.boundary_points(own.latent), own.scale, own.mount)
+            return shape.boundary_points(own)
 
     if threads <= 1:
-        return part(theta)
-    return torch.cat(list(_pool(threads).map(part, theta.tensor_split(threads))))
+        return part(latent)
+    return torch.cat(list(_pool(threads).map(part, latent.tensor_split(threads))))
 
 
 @cache

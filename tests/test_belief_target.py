@@ -1,0 +1,128 @@
+"""Derivatives of the contact posterior against automatic ones and differences."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tpcd.belief.history import History, history_of
+from tpcd.belief.likelihood import linearised_likelihood
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.belief.target import ContactTarget, contact_target
+from tpcd.contact import scene_from_parameters
+from tpcd.data.episode import Episode
+from tpcd.parameters import Parameters
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings, StepStatus, native, simulate_step
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+STEPS = 6
+needs_numba = pytest.mark.skipif(not native.available(), reason="compares the compiled loops")
+
+
+@pytest.fixture(scope="module")
+def prior() -> ParameterPrior:
+    return make_prior(PolygonShape(builtin_outlines()["mug"]))
+
+
+@pytest.fixture(scope="module")
+def truth_and_episode(prior: ParameterPrior) -> tuple[Tensor, Episode]:
+    generator = torch.Generator().manual_seed(1)
+    scene = draw_scene("mug", prior.shape.outline.vertices, generator)
+    motion = make_motion("rich", scene, STEPS, generator)
+    episode = record(make_truth(scene, "quasistatic"), scene, motion, STEPS, generator).measured
+    theta = torch.tensor(list(scene.theta.values()), dtype=torch.float64)
+    return prior.to_score(theta), episode
+
+
+@needs_numba
+@pytest.mark.parametrize("friction", ["coulomb", "anitescu"])
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_settled_poses_move_with_theta_as_automatic_derivatives_say(
+    prior: ParameterPrior,
+    truth_and_episode: tuple[Tensor, Episode],
+    friction: str,
+    substeps: int,
+) -> None:
+    """Against readings without weight, the innovation is minus the pose in known units."""
+    truth, episode = truth_and_episode
+    settings = StepSettings(friction=friction, substeps=substeps)
+    history = history_of(episode)
+    noise = torch.randn(8, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    vectors, slopes = prior.to_vector_with_slope(truth + 0.2 * noise)
+    compared = 0
+    for k in range(STEPS):
+        unit = 1e4
+        one = History(
+            history.poses[k : k + 2],
+            torch.full((2, 3), unit**2, dtype=torch.float64) * torch.tensor([[1e-20], [1.0]]),
+            history.commands[k : k + 2],
+            history.stiffness,
+        )
+        found = linearised_likelihood(
+            prior.shape, vectors, slopes, torch.zeros(8).double(), one, MisfitField(0.0), settings
+        )
+        theta = vectors.clone().requires_grad_()
+        there = simulate_step(
+            scene_from_parameters(prior.shape, Parameters.from_vector(theta)),
+            one.start[0],
+            one.command[0],
+            one.stiffness,
+            settings,
+            previous=one.previous[0],
+        )
+        usable = there.status == int(StepStatus.CONVERGED)
+        for a in range(3):
+            (expected,) = torch.autograd.grad(there.pose[:, a].sum(), theta, retain_graph=True)
+            difference = (-unit * found.slopes[:, :, 0, a] - expected * slopes)[usable]
+            assert difference.abs().max() < 2e-5 * (1 + (expected * slopes).abs().max())
+            compared += int((expected[usable].abs().amax(-1) > 1e-3).sum())
+    assert compared > 40
+
+
+@needs_numba
+def test_compiled_derivatives_give_the_information_that_differences_give(
+    prior: ParameterPrior,
+    truth_and_episode: tuple[Tensor, Episode],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The change of the gain itself is left out: half of them agree to 10 %."""
+    truth, episode = truth_and_episode
+    target = contact_target(prior, MisfitField(1e-3, 1.0), StepSettings()).given(
+        history_of(episode)
+    )
+    noise = torch.randn(20, 8, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    score = torch.cat((truth, torch.zeros(1).double())) + 0.02 * noise
+    small = torch.full((8,), 1e-3, dtype=torch.float64)
+    _, compiled = target.curvature(score, small, 0.5)
+    monkeypatch.setattr(native, "available", lambda: False)
+    _, differences = target.curvature(score, small, 0.5)
+    error = torch.linalg.matrix_norm(compiled - differences)
+    assert (error / torch.linalg.matrix_norm(differences)).median() < 0.1
+    assert (torch.linalg.eigvalsh(compiled)[:, 0] > 0).all()
+
+
+def test_gradient_is_that_of_the_log_posterior(
+    prior: ParameterPrior, truth_and_episode: tuple[Tensor, Episode]
+) -> None:
+    """Up the gradient, scaled by the information, the log posterior rises nearly everywhere."""
+    truth, episode = truth_and_episode
+    target: ContactTarget = contact_target(prior, MisfitField(1e-3, 1.0), StepSettings()).given(
+        history_of(episode)
+    )
+    noise = torch.randn(30, 8, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    score = torch.cat((truth, torch.zeros(1).double())) + 0.02 * noise
+    gradient, information = target.curvature(score, torch.ones(8).double(), 1.0)
+    step = torch.linalg.solve(information, gradient)
+
+    def height(points: Tensor) -> Tensor:
+        return target.log_prior(points) + target.log_likelihood(points, None)[1]
+
+    gain = height(score + 1e-3 * step) - height(score)
+    expected = 1e-3 * (gradient * step).sum(-1)
+    assert (gain > 0).double().mean() > 0.8
+    assert float((gain / expected).median()) == pytest.approx(1.0, abs=0.2)

@@ -80,9 +80,15 @@ def test_a_stopped_estimation_goes_on_to_the_same_belief(
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
 
 
-def test_a_state_of_other_data_or_cut_off_is_refused(episode: Episode, tmp_path: Path) -> None:
+def test_a_state_of_other_data_or_version_or_cut_off_is_refused(
+    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert load_state(tmp_path, episode) is None
     save_state(next(steps("default", episode)).state, tmp_path, episode)
+    with monkeypatch.context() as patch:
+        patch.setattr("tpcd.belief.state.STATE_VERSION", "later")
+        with pytest.raises(RunError, match="another version"):
+            load_state(tmp_path, episode)
     other = replace(episode, poses=episode.poses + 1e-4)
     with pytest.raises(RunError, match="other numbers"):
         load_state(tmp_path, other)

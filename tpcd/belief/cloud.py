@@ -121,7 +121,8 @@ class Cloud:
     log_prior: Float[Tensor, " m"]
     log_likelihood: Float[Tensor, " m"]
     ancestor: Int[Tensor, " m"]
-    """Particle of the first cloud that each one descends from."""
+    """Particle before the last datum that each one descends from, or draw of importance
+    sampling (numbered after them)."""
     log_evidence: float
     log_evidence_std: float
     """Standard error of the log evidence."""
@@ -142,6 +143,7 @@ class CloudInfo:
     effective_sample_size: float
     """Smallest effective sample size met at a temperature."""
     distinct_ancestors: int
+    """Particles before the datum, and draws, that the particles descend from."""
     evaluations: int
     """Likelihood evaluations of one particle on the whole history, without derivatives."""
 

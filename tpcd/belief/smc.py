@@ -4,9 +4,10 @@ A cloud of equally weighted particles represents the posterior of the history so
 datum is brought in by degrees: the log likelihood goes from the old history to the new one
 through temperatures chosen so that half of the effective sample size is kept each time;
 after each, particles are resampled and moved by Metropolis-Hastings steps that leave the
-tempered posterior invariant. Moves alternate between independent draws from a mixture
-fitted to the cloud and local steps. The product of mean weights estimates the evidence, its
-variance comes from the families of common ancestors (Lee and Whiteley 2018).
+tempered posterior invariant. Moves alternate between independent draws from a mixture that
+follows the curvature of the target and local steps in the shape of its components. Once the
+datum is in, particles exchange themselves for draws of `importance`, which also estimate the
+evidence, and are moved again.
 
 The target is any function of unconstrained coordinates: the contact model in `Belief`, a
 linear-normal model with known answers in the tests.
@@ -50,10 +51,8 @@ def assimilate(
         gain = state.with_datum - state.before
         gain = torch.where(torch.isfinite(gain), gain, -torch.inf)
         advance = _next_temperature(gain, temperature, settings.kept_share) - temperature
-        log_weights = advance * gain
-        weights = normalise_log_weights(log_weights)
+        weights = normalise_log_weights(advance * gain)
         smallest = min(smallest, effective_sample_size(weights))
-        state = state.weighted(log_weights, weights)
         state = state.take(systematic_resample(weights, count or len(weights), generator))
         temperature += advance
         tally.temperatures += 1
@@ -83,11 +82,6 @@ class _State:
     cloud: Cloud
     before: Tensor
     with_datum: Tensor
-
-    def weighted(self, log_weights: Tensor, weights: Tensor) -> _State:
-        mean = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
-        cloud = replace(self.cloud, log_evidence=self.cloud.log_evidence + float(mean))
-        return replace(self, cloud=cloud)
 
     def take(self, index: Tensor) -> _State:
         cloud = self.cloud

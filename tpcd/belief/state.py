@@ -21,6 +21,8 @@ from tpcd.data.episode import Episode
 from tpcd.errors import RunError
 
 STATE_FILE = "state.safetensors"
+STATE_VERSION = "2"
+"""Changes with what an estimator keeps."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,11 @@ def save_state(state: EstimatorState, folder: Path, episode: Episode) -> None:
     target = folder / STATE_FILE
     content = {name: value.contiguous() for name, value in state.tensors.items()}
     content["generator"] = state.generator
-    card = {"index": str(state.index), "episode": fingerprint(episode)}
+    card = {
+        "version": STATE_VERSION,
+        "index": str(state.index),
+        "episode": fingerprint(episode),
+    }
     staged = target.with_suffix(".staged")
     staged.write_bytes(save_tensors(content, card))
     os.replace(staged, target)
@@ -65,6 +71,8 @@ def load_state(folder: Path, episode: Episode) -> EstimatorState | None:
         generator = tensors.pop("generator")
     except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
         raise RunError(path, f"cannot be read ({error})", "estimate again") from error
+    if card.get("version") != STATE_VERSION:
+        raise RunError(path, "was left by another version of tpcd", "estimate again")
     if of != fingerprint(episode):
         raise RunError(path, "belongs to an episode with other numbers", "estimate again")
     return EstimatorState(index, tensors, generator)

@@ -54,7 +54,8 @@ class HistoryLikelihood:
     `total` is the log likelihood of all transitions and `before` of all but the last, both
     -inf for a particle that was given up; `field_mean` and `field_covariance` the normal
     posterior of the misfit coefficients. Where they are asked for, `whitened` and `log_scale`
-    are the innovations of the n transitions (see `kalman.Innovation`), NaN without one.
+    are the innovations of the n transitions (see `kalman.Innovation`), NaN without one, and
+    `slopes` the derivatives of `whitened` by d coordinates.
     """
 
     total: Float[Tensor, " m"]
@@ -197,6 +198,7 @@ def _compiled(
             world, law, request, measured, by_theta, found, first, last
         ),
         count,
+        len(history),
     )
     answer = HistoryLikelihood(total, before, mean, covariance)
     if innovations:

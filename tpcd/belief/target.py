@@ -63,7 +63,7 @@ class ContactTarget:
         self, score: Float[Tensor, "m s"], spread: Float[Tensor, " s"], temperature: float
     ) -> tuple[Float[Tensor, "m s"], Float[Tensor, "m s s"]]:
         """Gradient of the log posterior with the last transition tempered, and its Fisher
-        information, by differences of the innovations; `spread` is that of the particles.
+        information, from the derivatives of the innovations; `spread` is that of the particles.
 
         Of the prior its normal fit is taken. Entries that cannot be evaluated count as flat.
         """

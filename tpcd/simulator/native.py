@@ -47,18 +47,21 @@ def thread_count() -> int:
     return int(limit) if limit.isdecimal() and int(limit) > 0 else cores
 
 
-def in_parts(work: Callable[[int, int], None], count: int) -> None:
+def in_parts(work: Callable[[int, int], None], count: int, transitions: int = 1) -> None:
     """Call `work(first, last)` on parts of `count` elements, in as many threads as allowed.
+
+    Each element is so many transitions of work.
 
     The compiled loops release the interpreter lock. Threads of our own keep them apart from
     the OpenMP of torch, whose number of threads numba's parallel loops would reset, and whose
     threads make the small operations around these loops slow on a busy machine.
     """
-    threads = min(thread_count(), math.ceil(count / CHUNK))
+    chunks = min(count, math.ceil(count * transitions / CHUNK))
+    threads = min(thread_count(), chunks)
     if threads <= 1:
         work(0, count)
         return
-    parts = min(4 * threads, math.ceil(count / CHUNK))
+    parts = min(4 * threads, chunks)
     bounds = [part * count // parts for part in range(parts + 1)]
     list(_pool(threads).map(work, bounds[:-1], bounds[1:]))
 

@@ -80,13 +80,14 @@ def draw_pool(
     """Draws weighted by the target, from components that start at the cloud and the modes."""
     spread, components = cloud.std(0), settings.at_most(settings.components)
     modes, first, evaluations = find_modes(target, remembered, spread, settings, generator)
-    centres = cloud[torch.randperm(len(cloud), generator=generator)[:components]]
-    mixture = last = StudentMixture.joined([first, _at(target, centres, spread)])
+    around = mixture_of_cloud(target, cloud, 1.0, settings, generator)
+    mixture = last = StudentMixture.joined([first, around])
     pool, log_weights = None, cloud.new_zeros(0)
     for _ in range(settings.importance_rounds):
         if pool is not None:
             chosen = _spread_choice(log_weights, components, generator)
-            last = _at(target, pool.positions[chosen], spread)
+            centres = pool.positions[chosen]
+            last = newton_mixture(centres, *target.curvature(centres, spread, 1.0))
             sums = torch.logaddexp(pool.log_sum, last.log_sum(pool.positions))
             pool = replace(pool, log_sum=sums)
             mixture = StudentMixture.joined([mixture, last])
@@ -99,6 +100,19 @@ def draw_pool(
         log_weights = height - pool.log_sum + math.log(len(mixture.mean))
     assert pool is not None
     return Pool(pool, log_weights, mixture, last, modes, evaluations)
+
+
+def mixture_of_cloud(
+    target: Target,
+    cloud: Float[Tensor, "m d"],
+    temperature: float,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> StudentMixture:
+    """Components at some of the particles, for the target with its new datum tempered."""
+    count = settings.at_most(settings.components)
+    centres = cloud[torch.randperm(len(cloud), generator=generator)[:count]]
+    return newton_mixture(centres, *target.curvature(centres, cloud.std(0), temperature))
 
 
 def exchange(
@@ -152,10 +166,6 @@ def _draw(
 def _join(first: Draws, second: Draws) -> Draws:
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     return Draws(*(torch.cat(pair) for pair in pairs))
-
-
-def _at(target: Target, points: Tensor, spread: Tensor) -> StudentMixture:
-    return newton_mixture(points, *target.curvature(points, spread, 1.0))
 
 
 def _spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, SamplerSettings, Target
-from tpcd.belief.importance import Pool, draw_pool, exchange
+from tpcd.belief.importance import Pool, draw_pool, exchange, mixture_of_cloud
 from tpcd.belief.likelihood import Threshold
-from tpcd.belief.proposals import StudentMixture, newton_mixture
+from tpcd.belief.proposals import StudentMixture
 from tpcd.belief.resampling import (
     effective_sample_size,
     normalise_log_weights,
@@ -57,7 +57,8 @@ def assimilate(
         temperature += advance
         tally.temperatures += 1
         if temperature < 1.0:
-            mixture = _fit(state.cloud.positions, target, temperature, settings, generator)
+            here = state.cloud.positions
+            mixture = mixture_of_cloud(target, here, temperature, settings, generator)
             moves = settings.tempering_moves
             state = _move(state, mixture, moves, temperature, target, settings, generator, tally)
     pool = draw_pool(target, state.cloud.positions, state.cloud.modes, settings, generator)
@@ -222,18 +223,3 @@ def _move(
         of_here = torch.where(accepted[:, None], of_there, of_here)
         tally.count("independent" if independent else "local", len(here), int(accepted.sum()))
     return state
-
-
-def _fit(
-    positions: Tensor,
-    target: Target,
-    temperature: float,
-    settings: SamplerSettings,
-    generator: torch.Generator,
-) -> StudentMixture:
-    """Components at some of the particles."""
-    count = min(settings.at_most(settings.components), len(positions))
-    chosen = torch.randperm(len(positions), generator=generator)[:count]
-    points = positions[chosen]
-    gradient, information = target.curvature(points, positions.std(0), temperature)
-    return newton_mixture(points, gradient, information)

@@ -8,8 +8,8 @@ transition starts at the true pose of the row before, and the true settled pose 
 plus H c, with the derivative H of that transition and one draw of the misfit field c and its
 size for each run; pose and wrench are measured with noise.
 Commands depend on earlier measurements only (tpcd/truth/motions.py), which no posterior
-minds; the motion's start pose alone knows the floor and the wall (10 to 20 mm above the
-floor), and that knowledge is not in the likelihood. What is not exact: the filter's
+minds, and the start pose is drawn without regard to theta, as long as the object is free
+there and near the floor, which the first data say anyway. What is not exact: the filter's
 linearisation in the start pose; a misfit so large that the angle at which it is read does not
 settle (some centimetres; keep `--misfit` to millimetres); the robust treatment of outliers and
 of bad parity, which concerns about 1 datum in 1000 each. With `--estimator paper` the data are
@@ -42,6 +42,11 @@ RUNS_FILE = "runs.jsonl"
 BINS = 10
 ANGLE_ROUNDS = 40
 """Rounds, each of half a step, in which the angle at which the misfit is read settles."""
+LEFTMOST_START = 0.12
+HIGHEST_START = 0.20
+"""Start poses lie so far left of the origin, and over the lowest floor, at most [m]."""
+LARGEST_GAP = 0.02
+"""Distance from the floor at the start at most [m]: it is met within two steps."""
 
 
 @dataclass(frozen=True)
@@ -127,25 +132,33 @@ def draw_episode(
     from tpcd.belief.misfit import misfit_rows
     from tpcd.contact import scene_from_parameters
     from tpcd.data.episode import Episode
-    from tpcd.parameters import SCENE_NAMES
     from tpcd.simulator import simulate_step
     from tpcd.truth.motions import History, rich_exploration
     from tpcd.truth.recording import DEFAULT_SENSOR_STD
-    from tpcd.truth.scene import draw_scene
+    from tpcd.truth.scene import DEFAULT_STIFFNESS
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    score = prior.sample(1, generator)
+    # A start pose drawn without regard to theta says something about theta all the same: the
+    # object is free there. The likelihood knows that, so pairs of both are drawn until it is.
+    start = torch.zeros(3, dtype=torch.float64)
+    low, high = (edge[prior.names.index("floor_height")] for edge in (prior.low, prior.high))
+    while True:
+        score = prior.sample(1, generator)
+        parameters = prior.to_parameters(score[0])
+        scene = scene_from_parameters(prior.shape, parameters)
+        draw = torch.rand(2, generator=generator, dtype=torch.float64)
+        start[0] = -LEFTMOST_START * draw[0]
+        start[1] = low + draw[1] * (high - low + HIGHEST_START)
+        points = scene.points_ee + start[:2]
+        floor_gap, wall_gap = (body.signed_distance(points).min() for body in scene.terrains)
+        if 0 < floor_gap < LARGEST_GAP and wall_gap > 0:
+            break
     vector = prior.to_vector(score)[0]
     field = misfit_field(prior.shape, settings)
     misfit_sd = field.sd_of(normal(1))[0]
-    parameters = prior.to_parameters(score[0])
-    outline = prior.shape.boundary_points(parameters.latent)
-    entries = vector[prior.shape.latent_dim :].tolist()
-    theta: dict[str, float] = dict(zip(SCENE_NAMES, entries, strict=True))
-    start = draw_scene("drawn", outline.numpy(), generator, fixed=theta)
-    scene, stiffness = scene_from_parameters(prior.shape, parameters), start.stiffness
+    stiffness = torch.tensor(DEFAULT_STIFFNESS, dtype=torch.float64)
     coefficients = misfit_sd * normal(field.bumps * len(scene.terrains))
     sensor_std = torch.tensor(DEFAULT_SENSOR_STD, dtype=torch.float64)
     # `history_of` adds what any simulator's numerics leave to the noise of the poses.
@@ -154,7 +167,7 @@ def draw_episode(
     weight = pose_std**2 / (pose_std**2 + wrench_variance)
 
     motion = rich_exploration(generator)
-    settled = start.start_pose
+    settled = start
     commands = settled[None].clone()
     poses = (settled + pose_std * normal(3))[None]
     wrenches = (sensor_std[3:] * normal(3))[None]

@@ -1,128 +1,212 @@
-"""Climbing to modes, weighted draws and the exchange, on targets with known answers."""
+"""Laws of the sampler, on a linear-normal model with known posterior and evidence."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import pytest
 import torch
+from linear_model import DIMENSION, LinearModel
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings
-from tpcd.belief.importance import draw_pool, exchange
-from tpcd.belief.modes import climb, find_modes, log_target
+from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
+from tpcd.belief.importance import assimilate, cut_off, draw_pool
 
-DIMENSION = 2
-CENTRES = torch.tensor([[2.0, 0.0], [-2.0, 1.0], [0.0, -3.0]], dtype=torch.float64)
-SHARES = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
-WIDTH = 0.1
+SETTINGS = SamplerSettings(particles=2000, wanted=2000.0)
+FEW = SamplerSettings(particles=500, places=20, fresh_modes=20, modes=5)
 
 
-@dataclass(frozen=True)
-class ThreeModes:
-    """A likelihood of three narrow normals of known shares, under a flat enough prior."""
-
-    prior_std: float = 3.0
-
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        normal = torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
-        return self.prior_std * normal
-
-    def log_prior(self, x: Tensor) -> Tensor:
-        square = (x**2).sum(-1) / self.prior_std**2
-        return -0.5 * square - DIMENSION * math.log(self.prior_std * math.sqrt(2 * math.pi))
-
-    def log_likelihood(self, x: Tensor, threshold: object) -> tuple[Tensor, Tensor]:
-        square = ((x[:, None] - CENTRES) ** 2).sum(-1) / WIDTH**2
-        # Shares of the posterior, so the prior at the centres is taken out.
-        terms = SHARES.log() - self.log_prior(CENTRES) - 0.5 * square
-        total = torch.logsumexp(terms, -1) - math.log(2 * math.pi * WIDTH**2)
-        return torch.zeros_like(total), total
-
-    def curvature(self, x: Tensor, spread: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
-        nearest = ((x[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
-        gradient = (CENTRES[nearest] - x) / WIDTH**2
-        return gradient, torch.eye(DIMENSION).double().expand(len(x), -1, -1) / WIDTH**2
+def start(count: int = 500, seed: int = 0) -> Cloud:
+    generator = torch.Generator().manual_seed(seed)
+    return start_cloud(torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64))
 
 
-def share_at(x: Tensor, weights: Tensor) -> Tensor:
-    nearest = ((x[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
-    return torch.zeros(3, dtype=torch.float64).index_add(0, nearest, weights / weights.sum())
+def run(
+    model: LinearModel, stops: list[int], seed: int, settings: SamplerSettings
+) -> tuple[Cloud, list[tuple[float, float]]]:
+    """Bring in the data up to each stop; the cloud and (log evidence, error) after each."""
+    generator = torch.Generator().manual_seed(seed)
+    cloud, evidence = start(settings.particles, seed), []
+    for datum, stop in enumerate(stops, start=1):
+        cloud, info = assimilate(cloud, model.target(stop), datum, settings, generator)
+        assert info.effective_sample_size > 1
+        evidence.append((cloud.log_evidence, cloud.log_evidence_std))
+    return cloud, evidence
 
 
-def test_a_climb_gains_at_every_step_and_arrives() -> None:
-    target = ThreeModes()
-    start = target.sample(50, torch.Generator().manual_seed(0))
-    heights = [log_target(target, start)]
-    for rounds in (1, 2, 4, 8):
-        points, height = climb(target, start, rounds)
-        assert (height >= heights[-1]).all()
-        heights.append(height)
-    assert ((points[:, None] - CENTRES).norm(dim=-1).amin(-1) < 0.01).all()
+def test_several_data_one_after_another_give_the_known_posterior() -> None:
+    model = LinearModel(6)
+    cloud, _ = run(model, [1, 2, 3, 4, 5, 6], 1, SETTINGS)
+    mean, covariance, _ = model.posterior(6)
+    std = covariance.diagonal().sqrt()
+    found_mean = cloud.weights @ cloud.positions
+    assert ((found_mean - mean).abs() / std).max() < 0.1
+    factor = torch.linalg.cholesky(covariance)
+    whitened = torch.linalg.solve_triangular(factor, (cloud.positions - found_mean).T, upper=False)
+    found = (cloud.weights * whitened) @ whitened.T
+    assert (found - torch.eye(DIMENSION, dtype=torch.float64)).abs().max() < 0.15
 
 
-def test_each_mode_is_found_once_and_remembered() -> None:
-    target, generator = ThreeModes(), torch.Generator().manual_seed(1)
-    settings = SamplerSettings(fresh_modes=60, modes=10)
-    empty, ones = torch.zeros(0, 2).double(), torch.ones(2).double()
-    modes, mixture, _ = find_modes(target, empty, ones, settings, generator)
-    assert len(modes) == len(mixture.mean) == 3
-    assert (torch.cdist(CENTRES, modes).amin(-1) < 0.01).all()
-    one = SamplerSettings(fresh_modes=1, modes=10)
-    again, _, _ = find_modes(target, modes, ones, one, generator)
-    torch.testing.assert_close(again, modes, atol=1e-3, rtol=0)
+def test_evidence_of_every_stop_lies_within_its_stated_error() -> None:
+    """Ten runs of four data, 40 z-scores: of honest errors at most 3 lie beyond 2.6 sd
+    (probability of more: 1e-4), and their root mean square is below 1.5."""
+    model = LinearModel(4, seed=3)
+    scores = []
+    for seed in range(10):
+        _, evidence = run(model, [1, 2, 3, 4], seed, FEW)
+        for count, (value, error) in enumerate(evidence, start=1):
+            assert error > 0
+            scores.append((value - model.posterior(count)[2]) / error)
+    found = torch.tensor(scores)
+    assert (found.abs() > 2.6).sum() <= 3
+    assert found.square().mean().sqrt() < 1.5
 
 
-def test_a_cloud_in_one_mode_still_gives_all_modes_their_share_and_the_evidence() -> None:
-    target, generator = ThreeModes(), torch.Generator().manual_seed(2)
-    cloud = CENTRES[0] + WIDTH * torch.randn(400, 2, generator=generator, dtype=torch.float64)
-    settings = SamplerSettings(fresh_modes=60, components=30)
-    pool = draw_pool(target, cloud, torch.zeros(0, 2).double(), settings, generator)
-    share = share_at(pool.draws.positions, pool.log_weights.exp())
-    torch.testing.assert_close(share, SHARES, atol=0.05, rtol=0)
-    # The prior varies a little within a mode: by less than 1 % of its height.
-    assert abs(pool.log_evidence) < 4 * pool.log_evidence_std + 0.01
-    weights = target.log_prior(cloud) + target.log_likelihood(cloud, None)[1]
-    weights = weights - pool.mixture.log_density(cloud)
-    leaves, index = exchange(weights, pool.log_weights, 0.25, generator)
-    after = torch.where(leaves[:, None], pool.draws.positions[index], cloud)
-    share = share_at(after, torch.ones(400).double())
-    assert leaves.double().mean() > 0.9
-    torch.testing.assert_close(share, SHARES, atol=0.1, rtol=0)
+def test_one_batch_and_one_by_one_agree_and_order_within_a_batch_does_not_matter() -> None:
+    model = LinearModel(4, seed=5)
+    backwards = LinearModel(4, seed=5)
+    backwards.rows, backwards.data = model.rows.flip(0), model.data.flip(0)
+    whole, _ = run(model, [4], 7, SETTINGS)
+    turned, _ = run(backwards, [4], 7, SETTINGS)
+    single, _ = run(model, [1, 2, 3, 4], 8, SETTINGS)
+    std = model.posterior(4)[1].diagonal().sqrt()
+    assert whole.log_evidence == pytest.approx(turned.log_evidence, abs=0.05)
+    for other in (turned, single):
+        shift = whole.weights @ whole.positions - other.weights @ other.positions
+        assert (shift / std).abs().max() < 0.15
+        error = math.hypot(whole.log_evidence_std, other.log_evidence_std)
+        assert abs(whole.log_evidence - other.log_evidence) < 4 * error
 
 
-def test_weights_of_a_pool_are_those_of_its_joint_mixture() -> None:
-    target, generator = ThreeModes(), torch.Generator().manual_seed(3)
-    cloud = target.sample(200, generator)
-    pool = draw_pool(target, cloud, torch.zeros(0, 2).double(), SamplerSettings(), generator)
-    draws = pool.draws
-    expected = target.log_prior(draws.positions) + draws.with_datum
-    expected = expected - pool.mixture.log_density(draws.positions)
-    torch.testing.assert_close(pool.log_weights, expected)
+def test_permuting_the_particles_changes_the_answer_by_chance_only() -> None:
+    model = LinearModel(3, seed=6)
+    cloud = start(2000)
+    order = torch.randperm(2000, generator=torch.Generator().manual_seed(1))
+    means, evidence = [], []
+    for positions in (cloud.positions, cloud.positions[order]):
+        after, _ = assimilate(
+            start_cloud(positions),
+            model.target(3),
+            1,
+            SETTINGS,
+            torch.Generator().manual_seed(1),
+        )
+        means.append(after.weights @ after.positions)
+        evidence.append(after.log_evidence)
+    std = model.posterior(3)[1].diagonal().sqrt()
+    assert ((means[0] - means[1]) / std).abs().max() < 0.1
+    assert abs(evidence[0] - evidence[1]) < 0.1
 
 
-@pytest.mark.parametrize("offset", [0.0, 1.0])
-def test_the_exchange_keeps_a_target_that_holds_already_whatever_the_draws(offset: float) -> None:
-    """Draws of a normal centred elsewhere: the mean of 40,000 particles stays what it was."""
-    generator = torch.Generator().manual_seed(4)
-    particles, spread = torch.randn(40_000, generator=generator, dtype=torch.float64), 1.5
-    means = []
-    for _ in range(20):
-        draws = offset + spread * torch.randn(40, generator=generator, dtype=torch.float64)
-
-        def log_weight(x: Tensor) -> Tensor:
-            return -0.5 * x**2 + 0.5 * ((x - offset) / spread) ** 2
-
-        leaves, index = exchange(log_weight(particles), log_weight(draws), 0.5, generator)
-        assert 0.3 < float(leaves.double().mean()) < 1.0
-        means.append(float(torch.where(leaves, draws[index], particles).mean()))
-    found = torch.tensor(means)
-    assert abs(float(found.mean())) < 4 * float(found.std()) / math.sqrt(20)
+def test_one_chunk_or_many_give_the_same_cloud() -> None:
+    model = LinearModel(2, seed=2)
+    whole = model.target(2).likelihood
+    clouds = []
+    for likelihood in (whole, lambda x: torch.cat([whole(part) for part in x.split(97)])):
+        generator = torch.Generator().manual_seed(4)
+        clouds.append(assimilate(start(), model.target(2, likelihood), 1, FEW, generator)[0])
+    torch.testing.assert_close(clouds[0].positions, clouds[1].positions, atol=1e-9, rtol=0)
+    torch.testing.assert_close(clouds[0].weights, clouds[1].weights, atol=0, rtol=0)
 
 
-def test_draws_without_weight_move_no_particle() -> None:
-    nothing = torch.full((10,), -torch.inf, dtype=torch.float64)
+def test_a_region_of_zero_likelihood_halves_the_evidence_and_holds_no_particle() -> None:
+    model = LinearModel(0)
+
+    def half(x: Tensor) -> Tensor:
+        return torch.where(x[:, 0] > 0, 0.0, -torch.inf).double()
+
     generator = torch.Generator().manual_seed(0)
-    leaves, _ = exchange(torch.zeros(5).double(), nothing, 0.5, generator)
-    assert not leaves.any()
+    cloud, _ = assimilate(start(), model.target(0, half), 1, SETTINGS, generator)
+    assert (cloud.positions[:, 0] > 0).all()
+    assert cloud.log_evidence == pytest.approx(math.log(0.5), abs=0.04)
+    mean = float(cloud.weights @ cloud.positions[:, 0])
+    assert mean == pytest.approx(math.sqrt(2 / math.pi), abs=0.04)
+
+
+def test_nan_likelihoods_count_as_zero_and_never_spread() -> None:
+    model = LinearModel(2)
+    whole = model.target(2).likelihood
+
+    def broken(x: Tensor) -> Tensor:
+        return torch.where(x[:, 1] > 1.0, torch.nan, whole(x))
+
+    generator = torch.Generator().manual_seed(0)
+    cloud, _ = assimilate(start(), model.target(2, broken), 1, FEW, generator)
+    assert (cloud.positions[:, 1] <= 1.0).all()
+    assert torch.isfinite(cloud.log_likelihood).all()
+    assert torch.isfinite(cloud.weights).all()
+    assert math.isfinite(cloud.log_evidence)
+
+
+def test_a_datum_that_nobody_explains_is_refused_in_words() -> None:
+    model = LinearModel(1)
+    nothing = model.target(1, lambda x: torch.full((len(x),), -torch.inf).double())
+    with pytest.raises(ValueError, match="no particle explains"):
+        assimilate(start(100), nothing, 1, FEW, torch.Generator().manual_seed(0))
+
+
+def test_an_uninformative_datum_gives_the_prior_back() -> None:
+    model = LinearModel(0)
+    generator = torch.Generator().manual_seed(0)
+    cloud, info = assimilate(start(200), model.target(0), 1, SETTINGS, generator)
+    assert info.effective_sample_size > 0.5 * info.draws
+    assert info.distinct > 1000
+    assert abs(cloud.log_evidence) < 4 * cloud.log_evidence_std + 1e-6
+    assert cloud.log_evidence_std < 0.05
+    spread = cloud.weights @ cloud.positions**2
+    torch.testing.assert_close(spread, torch.ones(DIMENSION).double(), atol=0.15, rtol=0)
+
+
+def test_rounds_end_once_the_draws_are_good_enough() -> None:
+    model = LinearModel(3)
+    for wanted, rounds in ((0.0, 4), (1e9, 6)):
+        settings = SamplerSettings(least_rounds=4, most_rounds=6, wanted=wanted, draws=500)
+        generator = torch.Generator().manual_seed(0)
+        pool = draw_pool(start(), model.target(3), 1, settings, generator)
+        assert pool.rounds == rounds
+        assert float(pool.shares.sum()) == pytest.approx(1.0)
+        assert (pool.shares > 0).all()
+
+
+def test_weights_that_are_cut_off_sum_to_one_and_none_dominates() -> None:
+    weights = torch.full((100,), 0.001, dtype=torch.float64)
+    weights[3], weights[5] = 0.902, 0.0
+    found = cut_off(weights, 10.0)
+    assert float(found.sum()) == pytest.approx(1.0)
+    assert float(found.max()) == pytest.approx(0.1, rel=1e-6)
+    assert found[5] == 0
+    even = torch.full((100,), 0.01, dtype=torch.float64)
+    torch.testing.assert_close(cut_off(even, 10.0), even)
+
+
+def test_evidence_is_not_biased_by_the_places_chosen() -> None:
+    """A prior without data: the mean of 20 estimates of log 1 within its error, and small."""
+    model = LinearModel(0)
+    found = []
+    for seed in range(20):
+        generator = torch.Generator().manual_seed(seed)
+        found.append(draw_pool(start(), model.target(0), 1, FEW, generator).log_evidence)
+    values = torch.tensor(found)
+    assert abs(float(values.mean())) < 4 * float(values.std()) / math.sqrt(20)
+    assert float(values.std()) < 0.05
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"particles": 3},
+        {"places": 0},
+        {"draws_per_place": 0},
+        {"least_rounds": 0},
+        {"most_rounds": 2},
+        {"draws": 10},
+        {"wanted": float("nan")},
+        {"prior_draws": 0},
+        {"modes": 0},
+        {"fresh_modes": 0},
+        {"climbing_rounds": -1},
+    ],
+)
+def test_settings_without_meaning_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        SamplerSettings(**wrong)

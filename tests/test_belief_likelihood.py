@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,7 +14,6 @@ from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.history import PARITY_LIMIT, History, history_of, parity_chi_square
 from tpcd.belief.likelihood import (
     HistoryLikelihood,
-    Threshold,
     _filter,
     highest_terms,
     history_likelihood,
@@ -80,21 +80,29 @@ def evaluate(
     vectors: Tensor,
     history: History,
     field: MisfitField = FIELD,
-    threshold: Threshold | None = None,
+    least: Tensor | None = None,
 ) -> HistoryLikelihood:
     sd = torch.full((len(vectors),), field.sd, dtype=torch.float64)
     parameters = Parameters.from_vector(vectors)
-    return history_likelihood(shape, parameters, sd, history, field, StepSettings(), threshold)
+    return history_likelihood(shape, parameters, sd, history, field, StepSettings(), least)
 
 
 @pytest.mark.parametrize("sd", [0.0, 1e-3])
-def test_before_is_the_likelihood_of_the_shorter_history(
+def test_the_last_transition_changes_nothing_of_what_came_before(
     shape: PolygonShape, episode: Episode, particles: Tensor, sd: float
 ) -> None:
     history, field = history_of(episode), MisfitField(sd=sd)
     whole = evaluate(shape, particles, history, field)
     shorter = evaluate(shape, particles, history.first(5), field)
-    torch.testing.assert_close(whole.before, shorter.total)
+    last = highest_terms(history)[-1]
+    assert (whole.total <= shorter.total + last + 1e-9).all()
+    scene = scene_from_parameters(shape, Parameters.from_vector(particles))
+    sds = torch.full((len(particles),), sd, dtype=torch.float64)
+    each = _filter(scene, sds, history, field, StepSettings(), innovations=True)
+    terms = -(0.5 * each.whitened**2 + each.log_scale + 0.5 * math.log(2 * math.pi)).sum(-1)
+    known = torch.isfinite(shorter.total)
+    assert known.any()
+    torch.testing.assert_close(shorter.total[known], terms[known, :5].sum(-1))
     if sd == 0.0:
         assert whole.field_mean.shape == (12, 0)
 
@@ -124,22 +132,19 @@ def test_no_term_exceeds_the_density_of_its_noise_at_zero(
     assert (terms > -torch.inf).any()
 
 
-@pytest.mark.parametrize("temperature", [0.3, 1.0])
 def test_a_threshold_changes_only_what_stays_below_it(
-    shape: PolygonShape, episode: Episode, particles: Tensor, temperature: float
+    shape: PolygonShape, episode: Episode, particles: Tensor
 ) -> None:
     history = history_of(episode)
-    plain = evaluate(shape, particles, history)
-    reached = plain.before + temperature * (plain.total - plain.before)
-    least = torch.full_like(reached, float(reached.median()))
+    plain = evaluate(shape, particles, history).total
+    least = torch.full_like(plain, float(plain.median()))
     least[0], least[1] = torch.inf, -torch.inf
-    found = evaluate(shape, particles, history, threshold=Threshold(least, temperature))
-    above = reached >= least
+    found = evaluate(shape, particles, history, least=least).total
+    above = plain >= least
     assert above.any() and not above.all()
-    torch.testing.assert_close(found.total[above], plain.total[above], rtol=0, atol=0)
-    torch.testing.assert_close(found.before[above], plain.before[above], rtol=0, atol=0)
-    given_up = found.total == -torch.inf
-    assert (given_up | (found.total == plain.total)).all()
+    torch.testing.assert_close(found[above], plain[above], rtol=0, atol=0)
+    given_up = found == -torch.inf
+    assert (given_up | (found == plain)).all()
     assert given_up[0] and not given_up[1] and not (given_up & above).any()
 
 

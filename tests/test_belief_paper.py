@@ -111,12 +111,12 @@ def test_the_filter_resamples_when_it_should_and_keeps_to_the_box(
 ) -> None:
     for step in steps:
         belief, info = step.belief, step.info
-        assert (info.effective_sample_size <= 750) == bool(info.temperatures)
+        assert (info.effective_sample_size <= 750) == bool(info.rounds)
         assert float(belief.weights.sum()) == pytest.approx(1.0)
         assert (belief.vectors >= belief.prior.low).all()
         assert (belief.vectors <= belief.prior.high).all()
         assert belief.misfit_mean.shape == (1500, 0)
-    assert any(step.info.temperatures for step in steps)
+    assert any(step.info.rounds for step in steps)
 
 
 def test_the_filter_learns_where_the_wall_is(

@@ -11,6 +11,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.parameters import DEFAULT_BOUNDS
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.density import MaskDensity
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
@@ -27,6 +28,9 @@ class MaskShape(PolygonShape):
 
     def log_density(self, latent):
         return self.density.log_density(latent)
+
+    def latent_curvature(self, latent):
+        return self.density.curvature(latent)
 
     def sample_latent(self, count, generator):
         return self.density.sample(count, generator)
@@ -119,3 +123,13 @@ def test_bumps_of_the_misfit_sum_to_its_variance_and_have_the_stated_correlation
     step = 1e-6
     numeric = (field.basis(angles + step)[0] - field.basis(angles - step)[0]) / (2 * step)
     torch.testing.assert_close(slope, numeric, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["ycb21-z2", "ycb-rich"])
+def test_gradient_of_the_log_prior_is_exact_and_its_precision_positive(name: str) -> None:
+    prior = make_prior(load_prior(name))
+    score = prior.sample(30, torch.Generator().manual_seed(3)).requires_grad_(True)
+    (expected,) = torch.autograd.grad(prior.log_density(score).sum(), score)
+    gradient, precision = prior.curvature(score.detach())
+    torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=1e-6)
+    assert (torch.linalg.eigvalsh(precision)[:, 0] > 0.99).all()

@@ -1,86 +1,140 @@
-"""The Student mixture: density, sampling, and components from the curvature of a target."""
+"""The curved mixture: density, sampling, and components from the curvature of a target."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_t
+from torch import Tensor
 
-from tpcd.belief.proposals import DEGREES_OF_FREEDOM, StudentMixture, newton_mixture
+from tpcd.belief.proposals import DEGREES_OF_FREEDOM, CurvedMixture, curved_mixture
+from tpcd.simulator import native
+
+COUNTS = torch.tensor([2.0, 1.0], dtype=torch.float64)
+DAMPINGS = (0.5, 6.0)
 
 
-def two_components(dimension: int) -> StudentMixture:
+def mixture_of(dimension: int, places: int = 2, counts: Tensor = COUNTS) -> CurvedMixture:
     generator = torch.Generator().manual_seed(0)
-    factor = torch.randn(2, dimension, dimension, generator=generator, dtype=torch.float64).tril()
-    factor.diagonal(dim1=-2, dim2=-1).abs_().add_(0.4)
-    mean = torch.randn(2, dimension, generator=generator, dtype=torch.float64)
-    return StudentMixture(mean, factor)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    root = normal(places, dimension, dimension)
+    return curved_mixture(
+        normal(places, dimension),
+        normal(places, dimension),
+        root @ root.mT,
+        counts,
+        dampings=DAMPINGS,
+    )
+
+
+def centres_and_scales(mixture: CurvedMixture) -> tuple[Tensor, Tensor]:
+    """Centre (k, t, d) and scale matrix (k, t, d, d) of every component."""
+    along = mixture.place[:, None] + mixture.offset
+    centre = torch.einsum("kab,kta->ktb", mixture.axes, along)
+    scale = torch.einsum("kab,kta,kac->ktbc", mixture.axes, mixture.spread**2, mixture.axes)
+    return centre, scale
 
 
 def test_density_is_that_of_scipy() -> None:
-    mixture = two_components(3)
+    mixture = mixture_of(3)
     points = 2 * torch.randn(50, 3, generator=torch.Generator().manual_seed(1)).double()
-    scales = (mixture.factor @ mixture.factor.mT).numpy()
+    centre, scale = (v.flatten(0, 1).numpy() for v in centres_and_scales(mixture))
+    share = (mixture.counts / mixture.counts.sum()).flatten().tolist()
     expected = sum(
-        0.5 * multivariate_t(mean, scale, df=DEGREES_OF_FREEDOM).pdf(points.numpy())
-        for mean, scale in zip(mixture.mean.numpy(), scales, strict=True)
+        part * multivariate_t(mean, matrix, df=DEGREES_OF_FREEDOM).pdf(points.numpy())
+        for part, mean, matrix in zip(share, centre, scale, strict=True)
     )
-    np.testing.assert_allclose(mixture.log_density(points).exp().numpy(), expected, rtol=1e-10)
+    np.testing.assert_allclose(mixture.log_density(points).exp().numpy(), expected, rtol=1e-9)
+
+
+@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
+@pytest.mark.parametrize("dimension", [1, 4, 7])
+def test_compiled_loops_and_torch_agree(dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Far points and components that are never drawn from included."""
+    mixture = mixture_of(dimension, 30, torch.tensor([3.0, 0.0], dtype=torch.float64))
+    points = torch.randn(300, dimension, generator=torch.Generator().manual_seed(1)).double()
+    points[:100] *= 1e4
+    compiled = mixture.log_sums(points)
+    monkeypatch.setattr(native, "available", lambda: False)
+    torch.testing.assert_close(compiled, mixture.log_sums(points), rtol=1e-9, atol=1e-9)
+    assert (compiled[:, 1] == -torch.inf).all()
 
 
 def test_density_integrates_to_one() -> None:
-    mixture = two_components(1)
+    mixture = mixture_of(1)
     grid = torch.linspace(-200, 200, 400_001, dtype=torch.float64)
     density = mixture.log_density(grid[:, None]).exp()
     assert float(torch.trapezoid(density, grid)) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_draws_have_the_density_they_are_said_to_have() -> None:
-    """The mean of p / q over draws of q is 1 for any normalised p: here a shifted mixture."""
-    mixture = two_components(2)
-    other = StudentMixture(mixture.mean + 0.3, mixture.factor)
-    draws = mixture.sample(40_000, torch.Generator().manual_seed(2))
-    ratio = (other.log_density(draws) - mixture.log_density(draws)).exp()
-    error = float(ratio.std()) / 200
+def test_draws_come_as_often_as_components_count_and_have_the_density_they_are_said_to_have() -> (
+    None
+):
+    """The mean of p / q over draws of q is 1 for any normalised p: here a single component."""
+    counts = torch.tensor([6000.0, 4000.0], dtype=torch.float64)
+    mixture = mixture_of(2, 2, counts)
+    draws = mixture.draw(torch.Generator().manual_seed(2))
+    assert len(draws) == 20_000
+    log_density = mixture.log_density(draws)
+    other = mixture_of(2, 2, torch.tensor([0.0, 1.0], dtype=torch.float64))
+    ratio = (other.log_density(draws) - log_density).exp()
+    error = float(ratio.std()) / math.sqrt(len(draws))
     assert abs(float(ratio.mean()) - 1) < 4 * error
 
 
-def test_joined_mixtures_weigh_all_components_alike() -> None:
-    mixture = two_components(2)
-    other = StudentMixture(mixture.mean[:1] + 2.0, mixture.factor[:1])
+def test_some_draws_are_spread_over_the_components_by_their_counts() -> None:
+    mixture = mixture_of(2, 2, torch.tensor([3.0, 0.0], dtype=torch.float64))
+    far = CurvedMixture(
+        mixture.axes,
+        mixture.place + torch.tensor([[0.0], [1e6]]).double(),
+        mixture.offset,
+        mixture.spread,
+        torch.tensor([[3.0, 0.0], [1.0, 0.0]]).double(),
+    )
+    draws = far.draw_some(400, torch.Generator().manual_seed(0))
+    assert int((draws.norm(dim=-1) > 1e5).sum()) == 100
+    assert len(draws) == 400
+
+
+def test_joined_mixtures_add_up_their_components() -> None:
+    mixture, other = mixture_of(2), mixture_of(2, 5)
     points = torch.randn(30, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    joined = StudentMixture.joined([mixture, other])
-    expected = (2 * mixture.log_density(points).exp() + other.log_density(points).exp()) / 3
-    torch.testing.assert_close(joined.log_density(points).exp(), expected)
-
-
-def normal_target(dimension: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean and information of a normal target."""
-    generator = torch.Generator().manual_seed(5)
-    root = torch.randn(dimension, dimension, generator=generator, dtype=torch.float64)
-    mean = torch.randn(dimension, generator=generator, dtype=torch.float64)
-    return mean, root @ root.T + torch.eye(dimension, dtype=torch.float64)
+    joined = CurvedMixture.joined([mixture, other])
+    expected = mixture.log_sum(points).exp() + other.log_sum(points).exp()
+    torch.testing.assert_close(joined.log_sum(points).exp(), expected)
+    assert float(joined.counts.sum()) == float(mixture.counts.sum() + other.counts.sum())
 
 
 def test_a_whole_newton_step_from_anywhere_gives_a_normal_target_itself() -> None:
-    mean, information = normal_target(3)
-    points = 3 * torch.randn(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    generator = torch.Generator().manual_seed(5)
+    root = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    mean = torch.randn(3, generator=generator, dtype=torch.float64)
+    information = root @ root.T + torch.eye(3, dtype=torch.float64)
+    points = 3 * torch.randn(6, 3, generator=generator, dtype=torch.float64)
     gradient = (mean - points) @ information
-    mixture = newton_mixture(points, gradient, information.expand(6, 3, 3), share=1.0)
-    torch.testing.assert_close(mixture.mean, mean.expand(6, 3))
-    covariance = mixture.factor @ mixture.factor.mT
-    torch.testing.assert_close(covariance, torch.linalg.inv(information).expand(6, 3, 3))
+    one = torch.ones(1, dtype=torch.float64)
+    mixture = curved_mixture(
+        points, gradient, information.expand(6, 3, 3), one, share=1.0, dampings=(0.0,)
+    )
+    centre, scale = centres_and_scales(mixture)
+    torch.testing.assert_close(centre[:, 0], mean.expand(6, 3))
+    torch.testing.assert_close(scale[:, 0], torch.linalg.inv(information).expand(6, 3, 3))
 
 
-def test_components_at_draws_of_a_normal_target_have_its_mean_and_covariance() -> None:
-    """For any share of the step: the mixture of 20,000 components keeps both moments."""
-    mean, information = normal_target(2)
-    covariance = torch.linalg.inv(information)
-    normal = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(1)).double()
-    points = mean + normal @ torch.linalg.cholesky(covariance).T
-    gradient = (mean - points) @ information
-    mixture = newton_mixture(points, gradient, information.expand(20_000, 2, 2), share=0.4)
-    torch.testing.assert_close(mixture.mean.mean(0), mean, atol=0.02, rtol=0)
-    within = (mixture.factor @ mixture.factor.mT)[0]
-    torch.testing.assert_close(within + torch.cov(mixture.mean.T), covariance, atol=0.02, rtol=0)
+def test_damping_shortens_flat_directions_and_leaves_steep_ones() -> None:
+    information = torch.diag(torch.tensor([1e4, 0.01], dtype=torch.float64))[None]
+    gradient = torch.tensor([[100.0, 0.01]], dtype=torch.float64)
+    mixture = curved_mixture(
+        torch.zeros(1, 2).double(), gradient, information, COUNTS, share=1.0, dampings=(0.0, 4.0)
+    )
+    centre, scale = (v[0] for v in centres_and_scales(mixture))
+    torch.testing.assert_close(centre[0], torch.tensor([0.01, 1.0]).double())
+    assert scale[0].diagonal().tolist() == pytest.approx([1e-4, 100.0])
+    assert scale[1].diagonal().tolist() == pytest.approx([1e-4, 1 / 4.01], rel=1e-3)
+    assert abs(float(centre[1, 1])) < 0.01

@@ -82,6 +82,24 @@ def test_mixture_log_density_agrees_with_torch_distributions(mixture: MixtureDen
     torch.testing.assert_close(mixture.raw_log_density(points), reference.log_prob(points))
 
 
+def test_mixture_curvature_has_the_gradient_and_bounds_the_hessian(mixture: MixtureDensity) -> None:
+    points = mixture.sample(20, torch.Generator().manual_seed(8)).requires_grad_(True)
+    (expected,) = torch.autograd.grad(mixture.raw_log_density(points).sum(), points)
+    gradient, precision = mixture.curvature(points.detach())
+    torch.testing.assert_close(gradient, expected)
+    hessian = torch.stack(
+        [torch.autograd.functional.hessian(mixture.raw_log_density, p.detach()) for p in points]
+    )
+    assert (torch.linalg.eigvalsh(precision + hessian) > -1e-9).all()
+    assert (torch.linalg.eigvalsh(precision) > 0).all()
+
+
+def test_a_mask_is_flat(mask: MaskDensity) -> None:
+    gradient, precision = mask.curvature(mask.sample(5, torch.Generator().manual_seed(8)))
+    assert gradient.shape == (5, 2) and not gradient.any()
+    assert precision.shape == (5, 2, 2) and not precision.any()
+
+
 @pytest.mark.parametrize("name", ["mask", "mixture"])
 def test_densities_survive_being_stored(name: str, request: pytest.FixtureRequest) -> None:
     density = request.getfixturevalue(name)

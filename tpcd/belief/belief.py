@@ -24,11 +24,11 @@ from tpcd.belief.cloud import (
     start_cloud,
 )
 from tpcd.belief.history import history_of
+from tpcd.belief.importance import assimilate
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
-from tpcd.belief.smc import assimilate
 from tpcd.belief.state import EstimatorState
-from tpcd.belief.target import ContactTarget, contact_target
+from tpcd.belief.target import ContactTarget
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
@@ -123,23 +123,15 @@ def estimate(
     prior = make_prior(shape, episode.priors)
     history = history_of(episode)
     misfit = misfit_field(shape, settings)
-    target = contact_target(prior, misfit, settings.step)
+    target = ContactTarget(prior, misfit, settings.step)
     if state is None:
-        count = settings.sampler.particles_at(1)
-        cloud = start_cloud(target.sample(count, generator), target.log_prior)
+        cloud = start_cloud(target.sample(settings.sampler.particles, generator))
     else:
         cloud = cloud_from_tensors(state.restore(generator))
     for k in range(1 if state is None else state.index + 1, len(history) + 1):
         started = time.perf_counter()
         target = target.given(history.first(k))
-
-        cloud, info = assimilate(
-            cloud,
-            target,
-            settings.sampler,
-            generator,
-            settings.sampler.particles_at(k),
-        )
+        cloud, info = assimilate(cloud, target, k, settings.sampler, generator)
         belief = _belief(cloud, target)
         seconds = time.perf_counter() - started
         after = EstimatorState(k, cloud_to_tensors(cloud), generator.get_state())
@@ -168,11 +160,10 @@ def weighted_quantile(
 
 def _belief(cloud: Cloud, target: ContactTarget) -> Belief:
     found = target.evaluate(cloud.positions)
-    count = len(cloud.positions)
     return Belief(
         prior=target.prior,
         vectors=target.prior.to_vector(cloud.positions[:, :-1]),
-        weights=torch.full((count,), 1.0 / count, dtype=torch.float64),
+        weights=cloud.weights,
         misfit=target.misfit,
         misfit_sd=target.misfit.sd_of(cloud.positions[:, -1]),
         misfit_mean=found.field_mean,

@@ -1,17 +1,16 @@
-"""The cloud of particles that tempered sequential Monte Carlo moves, its budget and its record."""
+"""The weighted particles that stand for a posterior, the budget that finds them, and its record."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.likelihood import Threshold
+from tpcd.belief.proposals import DAMPINGS
 
 LogDensity = Callable[[Tensor], Tensor]
 """Coordinates (m, d) to log density (m)."""
@@ -19,147 +18,129 @@ LogDensity = Callable[[Tensor], Tensor]
 
 @runtime_checkable
 class Target(Protocol):
-    """A log posterior in unconstrained coordinates (m, d), its last datum new."""
+    """A log posterior in unconstrained coordinates (m, d) of prior standard deviation 1."""
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws (count, d) from the prior."""
         ...
 
+    def scatter(self, count: int, generator: torch.Generator) -> Tensor:
+        """Points (count, d) from all over the prior to look for modes from."""
+        ...
+
     def log_prior(self, positions: Tensor) -> Tensor:
-        """Log density (m) of the prior."""
+        """Log density (m) of the prior, normalised."""
         ...
 
-    def log_likelihood(
-        self, positions: Tensor, threshold: Threshold | None
-    ) -> tuple[Tensor, Tensor]:
-        """Log likelihood (m) of the history before and with the new datum; a particle that
-        stays below its threshold may get -inf for both."""
+    def log_likelihood(self, positions: Tensor, least: Tensor | None) -> Tensor:
+        """Log likelihood (m) of the history; a particle that stays below its `least` (m) may
+        get -inf."""
         ...
 
-    def curvature(
-        self, positions: Tensor, spread: Tensor, temperature: float
-    ) -> tuple[Tensor, Tensor]:
-        """Gradient (m, d) and information (m, d, d), positive definite, of the log posterior
-        with its new datum tempered. Only proposals depend on them, so they need not be exact;
-        `spread` (d) is the standard deviation of the particles."""
+    def curvature(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient (m, d) and information (m, d, d), positive semi-definite, of the log
+        posterior. Only proposals depend on them, so they need not be exact."""
         ...
 
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """Budget and shape of the sampler."""
+    """Budget of the sampler for each datum."""
 
     particles: int = 700
-    """Particles in the cloud once the history is long."""
-    early_factor: float = 4.0
-    """So many times more particles at the first datum, falling as 1 / k with datum k: while the
-    history is short they are cheap, and the posterior is spread over many shapes."""
-    kept_share: float = 0.5
-    """Share of the effective sample size that one temperature step keeps."""
-    components: int = 60
-    """Components of the mixture that proposes."""
-    tempering_moves: int = 2
-    """Moves of every particle after each temperature but the last."""
-    final_moves: int = 4
-    """Moves at full likelihood once the datum is in."""
-    modes: int = 40
+    """Particles kept of all draws."""
+    places: int = 80
+    """Places that each round of importance sampling puts components at."""
+    draws_per_place: int = 9
+    """Draws at each place."""
+    least_rounds: int = 3
+    """Rounds of importance sampling at least."""
+    most_rounds: int = 4
+    """Rounds at most."""
+    wanted: float = 200.0
+    """Effective sample size of the trial draws at which no further round is begun."""
+    draws: int = 6000
+    """Draws from the mixture that the rounds arrived at, which are weighted."""
+    prior_draws: int = 1500
+    """Draws from the prior at the first datum, falling as 1 / k with datum k."""
+    modes: int = 20
     """Modes that are remembered from datum to datum."""
-    fresh_modes: int = 40
-    """Draws from the prior that climb to a mode at each datum."""
-    climbing_rounds: int = 6
-    """Newton steps of those."""
+    fresh_modes: int = 240
+    """Points that set out to climb to a mode at each datum."""
+    climbing_rounds: int = 2
+    """Newton steps before the lower half of those gives up."""
     following_rounds: int = 3
-    """Newton steps of the modes that are remembered."""
-    importance_rounds: int = 4
-    """Rounds of importance sampling at each datum."""
-    draws_per_component: int = 10
-    """Draws from each component."""
-    pool_share: float = 0.25
-    """Share of all draws that a particle may exchange itself for."""
-    independent_share: float = 0.5
-    """Share of moves that are independent draws from the mixture; the rest are local steps."""
+    """Newton steps of the modes that are remembered, and of those that did not give up."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
-        if self.particles < 16 or not 0 < self.kept_share < 1 or self.components < 1:
-            raise ValueError(
-                f"particles {self.particles} must be >= 16, kept_share {self.kept_share} in "
-                f"(0, 1), components {self.components} >= 1"
-            )
-        if self.early_factor < 1:
-            raise ValueError(f"early_factor is {self.early_factor}, expected at least 1")
-        for name in (
-            "tempering_moves",
-            "final_moves",
-            "climbing_rounds",
-            "following_rounds",
-        ):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least 0")
-        for name in ("modes", "fresh_modes", "importance_rounds", "draws_per_component"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
-        if not 0 < self.pool_share <= 1:
-            raise ValueError(f"pool_share is {self.pool_share}, expected over 0 and at most 1")
-        if not 0 <= self.independent_share <= 1:
-            raise ValueError(f"independent_share is {self.independent_share}, expected 0 to 1")
-
-    def at_most(self, count: int) -> int:
-        """So many components or modes, but no more than a tenth of the particles."""
-        return min(count, max(4, self.particles // 10))
-
-    def particles_at(self, datum: int) -> int:
-        """Particles in the cloud when datum 1, 2, ... is brought in."""
-        return round(self.particles * max(1.0, self.early_factor / datum))
+        least = {
+            "particles": 16,
+            "places": 1,
+            "draws_per_place": 1,
+            "least_rounds": 1,
+            "most_rounds": self.least_rounds,
+            "wanted": 0,
+            "draws": 100,
+            "prior_draws": 1,
+            "modes": 1,
+            "fresh_modes": 1,
+            "climbing_rounds": 0,
+            "following_rounds": 0,
+        }
+        for name, limit in least.items():
+            if not getattr(self, name) >= limit:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Equally weighted particles in unconstrained coordinates."""
+    """Weighted particles in unconstrained coordinates."""
 
     positions: Float[Tensor, "m d"]
-    log_prior: Float[Tensor, " m"]
+    weights: Float[Tensor, " m"]
+    """Weights that sum to 1."""
     log_likelihood: Float[Tensor, " m"]
-    ancestor: Int[Tensor, " m"]
-    """Particle before the last datum that each one descends from, or draw of importance
-    sampling (numbered after them)."""
     log_evidence: float
     log_evidence_std: float
     """Standard error of the log evidence."""
     modes: Float[Tensor, "k d"]
     """Modes found so far; none before the first datum."""
-    step_scale: float
-    """Scale of the local moves, adapted to an acceptance near 1/4."""
+    shares: Float[Tensor, " t"]
+    """Shares of the draws that go to each damping of the components."""
 
 
 @dataclass(frozen=True)
 class CloudInfo:
-    """What one update of the cloud cost and how well it mixed."""
+    """What one update of the cloud cost and how good the draws were."""
 
-    temperatures: int
-    moves: int
-    acceptance_independent: float
-    acceptance_local: float
+    rounds: int
+    """Rounds of importance sampling; with the paper's filter whether it resampled (0 or 1)."""
+    draws: int
+    """Draws that were weighted."""
     effective_sample_size: float
-    """Smallest effective sample size met at a temperature."""
-    distinct_ancestors: int
-    """Particles before the datum, and draws, that the particles descend from."""
+    """Of all draws; with the paper's filter the smallest one met."""
+    tail_shape: float
+    """Shape k of the distribution of the largest weights: over 0.7 they are not to be trusted
+    (NaN with the paper's filter)."""
+    distinct: int
+    """Different draws among the particles; with the paper's filter ancestors they have."""
     evaluations: int
-    """Likelihood evaluations of one particle on the whole history, without derivatives."""
+    """Evaluations of the likelihood of one particle on the whole history; its derivatives
+    count as three."""
 
 
-def start_cloud(positions: Float[Tensor, "m d"], log_prior: LogDensity) -> Cloud:
-    """A cloud of draws from the prior, before any datum."""
-    count, d = positions.shape
+def start_cloud(positions: Float[Tensor, "m d"]) -> Cloud:
+    """Draws from the prior, before any datum."""
+    count = len(positions)
     return Cloud(
         positions=positions,
-        log_prior=log_prior(positions),
+        weights=torch.full((count,), 1.0 / count, dtype=positions.dtype),
         log_likelihood=torch.zeros(count, dtype=positions.dtype),
-        ancestor=torch.arange(count),
         log_evidence=0.0,
         log_evidence_std=0.0,
         modes=positions[:0],
-        step_scale=2.38 / math.sqrt(d),
+        shares=positions.new_full((len(DAMPINGS),), 1.0 / len(DAMPINGS)),
     )
 
 

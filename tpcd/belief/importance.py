@@ -1,62 +1,63 @@
-"""Adaptive importance sampling: give each mode of the posterior its weight.
+"""Adaptive importance sampling of a growing history.
 
-Markov chains go from one mode to another too rarely, and along a thin bent sheet too slowly.
-Draws from a mixture, whose components sit at the modes and at particles, are weighted by the
-target; new components are put where the weight is, and all draws are weighted under all
-components (AMIS: Cornuet et al. 2012). The mean weight estimates the evidence.
+At each datum, trial draws from a mixture are weighted by the posterior of the whole history.
+The first components sit at modes and at particles of the datum before, a Newton step on; later
+ones where the weight is. All trial draws are weighted under the components of all rounds and
+the prior, which takes part with draws of its own (AMIS: Cornuet et al. 2012), until the
+effective sample size is what is wanted.
 
-Particles then choose between themselves and a random part of the draws (iterated sampling
-importance resampling: Andrieu, Lee and Vihola 2018). That leaves the target invariant for any
-number of draws: where the weights are poor, most particles stay what they are.
+A trial draw that became the centre of a component has made its own density large, and its
+weight too small. So the trial only shapes the mixture: what counts are new draws from it
+(Marin, Pudlo and Sedki 2019), whose mean weight estimates the evidence without bias.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings, Target
-from tpcd.belief.likelihood import Threshold
-from tpcd.belief.modes import find_modes
-from tpcd.belief.proposals import StudentMixture, newton_mixture
-from tpcd.belief.resampling import effective_sample_size, normalise_log_weights
+from tpcd.belief.cloud import Cloud, CloudInfo, SamplerSettings, Target
+from tpcd.belief.modes import CURVATURE_COST, climb, climbing_cost, find_modes
+from tpcd.belief.pareto import smooth_weights
+from tpcd.belief.proposals import CurvedMixture, curved_mixture
+from tpcd.belief.resampling import (
+    effective_sample_size,
+    normalise_log_weights,
+    systematic_resample,
+)
 
 _HOPELESS = 20.0
 """A draw whose log weight is so far below the best one counts as impossible."""
-_FEWEST_CENTRES = 50
-"""New components are spread as if no draw had more than this share of the weight (1 / count)."""
-_GROUPS = 16
-"""Groups of particles that look at the same part of the draws."""
-
-
-@dataclass(frozen=True)
-class Draws:
-    """n draws from a mixture."""
-
-    positions: Float[Tensor, "n d"]
-    log_prior: Float[Tensor, " n"]
-    before: Float[Tensor, " n"]
-    with_datum: Float[Tensor, " n"]
-    log_sum: Float[Tensor, " n"]
-    """Log of the sum of the component densities."""
+_LEAST_SHARE = 0.02
+"""Share of the draws that each damping keeps at least."""
+_FEWEST_PLACES = 300.0
+"""Places are chosen as if no draw had more than this share of the weight (1 / count), so that
+components also go where the draws found little so far."""
 
 
 @dataclass(frozen=True)
 class Pool:
-    """The draws of all rounds, from the joint mixture of all rounds, and their weights."""
+    """The draws that count, from the mixture that the rounds arrived at, and their weights."""
 
-    draws: Draws
+    positions: Float[Tensor, "n d"]
+    log_likelihood: Float[Tensor, " n"]
     log_weights: Float[Tensor, " n"]
-    mixture: StudentMixture
-    last: StudentMixture
-    """The components of the last round."""
+    """Log of posterior (not normalised) over proposal density."""
     modes: Float[Tensor, "k d"]
-    """Where components climbed to, from which the next datum starts."""
+    """Where points climbed to, from which the next datum starts."""
+    shares: Float[Tensor, " t"]
+    """What draws with each damping were worth."""
+    rounds: int
     evaluations: int
+
+    @property
+    def effective_sample_size(self) -> float:
+        """Kish's number of the draws."""
+        return effective_sample_size(_weights(self.log_weights))
 
     @property
     def log_evidence(self) -> float:
@@ -66,112 +67,209 @@ class Pool:
     @property
     def log_evidence_std(self) -> float:
         """Its standard error, from the variance of the weights."""
-        effective = effective_sample_size(normalise_log_weights(self.log_weights))
-        return math.sqrt(max(1.0 / effective - 1.0 / len(self.log_weights), 0.0))
+        spread = 1.0 / self.effective_sample_size - 1.0 / len(self.log_weights)
+        return math.sqrt(max(spread, 0.0))
+
+
+def assimilate(
+    cloud: Cloud,
+    target: Target,
+    datum: int,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> tuple[Cloud, CloudInfo]:
+    """The cloud of the history with datum 1, 2, ... as its last one, from the cloud before.
+
+    Raises ValueError where no particle can explain the datum at all.
+    """
+    pool = draw_pool(cloud, target, datum, settings, generator)
+    weights, shape = smooth_weights(pool.log_weights)
+    index, counts = systematic_resample(weights, settings.particles, generator).unique(
+        return_counts=True
+    )
+    after = Cloud(
+        positions=pool.positions[index],
+        weights=counts.double() / settings.particles,
+        log_likelihood=pool.log_likelihood[index],
+        log_evidence=pool.log_evidence,
+        log_evidence_std=pool.log_evidence_std,
+        modes=pool.modes,
+        shares=pool.shares,
+    )
+    info = CloudInfo(
+        rounds=pool.rounds,
+        draws=len(pool.log_weights),
+        effective_sample_size=pool.effective_sample_size,
+        tail_shape=shape,
+        distinct=len(index),
+        evaluations=pool.evaluations,
+    )
+    return after, info
 
 
 def draw_pool(
+    cloud: Cloud,
     target: Target,
-    cloud: Float[Tensor, "m d"],
-    remembered: Float[Tensor, "k d"],
+    datum: int,
     settings: SamplerSettings,
     generator: torch.Generator,
 ) -> Pool:
-    """Draws weighted by the target, from components that start at the cloud and the modes."""
-    spread, components = cloud.std(0), settings.at_most(settings.components)
-    modes, first, evaluations = find_modes(target, remembered, spread, settings, generator)
-    around = mixture_of_cloud(target, cloud, 1.0, settings, generator)
-    mixture = last = StudentMixture.joined([first, around])
-    pool, log_weights = None, cloud.new_zeros(0)
-    for _ in range(settings.importance_rounds):
-        if pool is not None:
-            chosen = _spread_choice(log_weights, components, generator)
-            centres = pool.positions[chosen]
-            last = newton_mixture(centres, *target.curvature(centres, spread, 1.0))
-            sums = torch.logaddexp(pool.log_sum, last.log_sum(pool.positions))
-            pool = replace(pool, log_sum=sums)
-            mixture = StudentMixture.joined([mixture, last])
-        component = torch.arange(len(last.mean)).repeat(settings.draws_per_component)
-        new = _draw(target, last, mixture, component, log_weights, generator)
-        evaluations += len(component)
-        pool = new if pool is None else _join(pool, new)
-        height = pool.log_prior + pool.with_datum
-        height = torch.where(torch.isfinite(height), height, -torch.inf)
-        log_weights = height - pool.log_sum + math.log(len(mixture.mean))
-    assert pool is not None
-    return Pool(pool, log_weights, mixture, last, modes, evaluations)
+    """Adapt a mixture that starts at the cloud and the modes, and draw from it."""
+    peaks = find_modes(target, cloud.modes, settings, generator)
+    followed, evaluations = _follow(cloud, target, settings, generator)
+    shares = cloud.shares
+    counts = _counts(shares, settings.draws_per_place)
+    mixture = CurvedMixture.joined(
+        [
+            curved_mixture(peaks.points, peaks.gradient, peaks.information, counts),
+            curved_mixture(followed, *target.curvature(followed), counts),
+        ]
+    )
+    evaluations += peaks.evaluations + CURVATURE_COST * len(followed)
+    trial = _of_prior(target, max(1, settings.prior_draws // datum), generator)
+    for rounds in range(1, settings.most_rounds + 1):
+        trial, by_damping = trial.add(target, mixture, generator)
+        log_weights = trial.log_weights
+        weights = cut_off(_weights(log_weights), math.sqrt(len(log_weights)))
+        worth = weights @ by_damping.softmax(-1).nan_to_num(0.0)
+        shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
+        enough = effective_sample_size(weights) >= settings.wanted
+        if rounds == settings.most_rounds or (rounds >= settings.least_rounds and enough):
+            break
+        centres = trial.positions[_spread_choice(log_weights, settings.places, generator)]
+        counts = _counts(shares, settings.draws_per_place)
+        mixture = curved_mixture(centres, *target.curvature(centres), counts)
+        evaluations += CURVATURE_COST * len(centres)
+    positions, log_likelihood, log_weights = trial.draw(target, settings.draws, generator)
+    evaluations += len(trial.positions) + len(positions)
+    return Pool(positions, log_likelihood, log_weights, peaks.points, shares, rounds, evaluations)
 
 
-def mixture_of_cloud(
-    target: Target,
-    cloud: Float[Tensor, "m d"],
-    temperature: float,
-    settings: SamplerSettings,
-    generator: torch.Generator,
-) -> StudentMixture:
-    """Components at some of the particles, for the target with its new datum tempered."""
-    count = settings.at_most(settings.components)
-    centres = cloud[torch.randperm(len(cloud), generator=generator)[:count]]
-    return newton_mixture(centres, *target.curvature(centres, cloud.std(0), temperature))
+def _counts(shares: Tensor, total: int) -> Tensor:
+    """Whole numbers near shares of the total, by the largest remainders."""
+    whole = (shares * total).floor()
+    missing = int(total - whole.sum())
+    whole[(shares * total - whole).topk(missing).indices] += 1
+    return whole
 
 
-def exchange(
-    log_weights: Float[Tensor, " m"],
-    pool: Float[Tensor, " n"],
-    share: float,
-    generator: torch.Generator,
-) -> tuple[Bool[Tensor, " m"], Int[Tensor, " m"]]:
-    """Which particles leave for a draw of the pool, and which one.
-
-    Each looks at a random share of the pool and chooses among these draws and itself in
-    proportion to the weights (of the target relative to the mixture, on one scale). Some
-    particles look at the same share.
-    """
-    leaves = torch.zeros(len(log_weights), dtype=torch.bool)
-    chosen = torch.zeros(len(log_weights), dtype=torch.int64)
-    group = torch.randint(_GROUPS, (len(log_weights),), generator=generator)
-    for i in range(_GROUPS):
-        members = torch.nonzero(group == i).flatten()
-        seen = torch.rand(len(pool), generator=generator) < share
-        offered = torch.where(seen, pool, -torch.inf)
-        total = torch.logsumexp(offered, 0)
-        if len(members) == 0 or not bool(torch.isfinite(total)):
-            continue
-        odds = torch.rand(len(members), generator=generator, dtype=pool.dtype)
-        leaves[members] = odds.logit() < total - log_weights[members]
-        chosen[members] = torch.multinomial(
-            (offered - total).exp(), len(members), replacement=True, generator=generator
+def _weights(log_weights: Tensor) -> Tensor:
+    if not bool((log_weights > -torch.inf).any()):
+        raise ValueError(
+            "no particle explains the new datum (every likelihood is zero or NaN); "
+            "check units and frames of the data against the priors"
         )
-    return leaves, chosen
+    return normalise_log_weights(log_weights)
 
 
-def _draw(
-    target: Target,
-    last: StudentMixture,
-    mixture: StudentMixture,
-    component: Tensor,
-    log_weights: Tensor,
-    generator: torch.Generator,
-) -> Draws:
-    """One draw from each of the named components of the last round."""
-    positions = last.draw(component, generator)
-    log_sum, log_prior = mixture.log_sum(positions), target.log_prior(positions)
-    best = float(log_weights.max()) if len(log_weights) else -torch.inf
-    least = best - _HOPELESS + log_sum - math.log(len(mixture.mean)) - log_prior
-    least = torch.where(torch.isfinite(log_prior), least, torch.inf)
-    before, with_datum = target.log_likelihood(positions, Threshold(least))
-    return Draws(positions, log_prior, before, with_datum, log_sum)
+def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
+    """Weights of which none is more than 1 / count of their sum, by and large.
+
+    The cut is repeated, since each one lowers the sum; n weights must be more than `count`.
+    """
+    for _ in range(30):
+        weights = weights.clamp_max(1.0 / count)
+        weights = weights / weights.sum()
+    return weights
 
 
-def _join(first: Draws, second: Draws) -> Draws:
-    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
-    return Draws(*(torch.cat(pair) for pair in pairs))
+@dataclass(frozen=True)
+class _Draws:
+    """Draws from the prior and from the components of all rounds."""
+
+    positions: Tensor
+    log_prior: Tensor
+    log_likelihood: Tensor
+    log_sum: Tensor
+    """Log of the sum of the densities that all of them were drawn from."""
+    mixture: CurvedMixture | None
+    from_prior: int
+
+    @property
+    def log_weights(self) -> Tensor:
+        found = self.log_prior + self.log_likelihood - self.log_sum
+        found = torch.where(torch.isfinite(found), found, -torch.inf)
+        return found + math.log(len(self.positions))
+
+    def add(
+        self, target: Target, last: CurvedMixture, generator: torch.Generator
+    ) -> tuple[_Draws, Tensor]:
+        """With the draws of one more round, all of them under the components of all rounds, and
+        the log sums of the last components by damping."""
+        new = last.draw(generator)
+        positions = torch.cat((self.positions, new))
+        by_damping = last.log_sums(positions)
+        log_prior = target.log_prior(new)
+        log_sum = log_prior + math.log(self.from_prior)
+        if self.mixture is not None:
+            log_sum = torch.logaddexp(log_sum, self.mixture.log_sum(new))
+        log_sum = torch.logaddexp(
+            torch.cat((self.log_sum, log_sum)), torch.logsumexp(by_damping, -1)
+        )
+        best = self.log_weights.max() - math.log(len(self.positions))
+        least = best - _HOPELESS + log_sum[-len(new) :] - log_prior
+        least = torch.where(torch.isfinite(log_prior), least, torch.inf)
+        draws = _Draws(
+            positions,
+            torch.cat((self.log_prior, log_prior)),
+            torch.cat((self.log_likelihood, target.log_likelihood(new, least))),
+            log_sum,
+            last if self.mixture is None else CurvedMixture.joined([self.mixture, last]),
+            self.from_prior,
+        )
+        return draws, by_damping
+
+    def draw(
+        self, target: Target, count: int, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """So many draws from prior and components together: positions, log likelihoods and log
+        weights."""
+        assert self.mixture is not None
+        total = len(self.positions)
+        from_prior = round(count * self.from_prior / total)
+        positions = torch.cat(
+            (
+                target.sample(from_prior, generator),
+                self.mixture.draw_some(count - from_prior, generator),
+            )
+        )
+        log_prior = target.log_prior(positions)
+        density = torch.logaddexp(
+            self.mixture.log_sum(positions), log_prior + math.log(self.from_prior)
+        ) - math.log(total)
+        least = self.log_weights.max() - _HOPELESS + density - log_prior
+        least = torch.where(torch.isfinite(log_prior), least, torch.inf)
+        log_likelihood = target.log_likelihood(positions, least)
+        log_weights = log_prior + log_likelihood - density
+        return (
+            positions,
+            log_likelihood,
+            torch.where(torch.isfinite(log_weights), log_weights, -torch.inf),
+        )
+
+
+def _of_prior(target: Target, count: int, generator: torch.Generator) -> _Draws:
+    positions = target.sample(count, generator)
+    log_prior = target.log_prior(positions)
+    log_likelihood = target.log_likelihood(positions, None)
+    return _Draws(positions, log_prior, log_likelihood, log_prior + math.log(count), None, count)
+
+
+def _follow(
+    cloud: Cloud, target: Target, settings: SamplerSettings, generator: torch.Generator
+) -> tuple[Tensor, int]:
+    """Particles that explain the new datum best, a damped Newton step on, and the cost."""
+    gain = target.log_likelihood(cloud.positions, None) - cloud.log_likelihood
+    log_weights = torch.where(torch.isfinite(gain), gain, -torch.inf) + cloud.weights.log()
+    if not bool(torch.isfinite(log_weights).any()):
+        # Nobody explains it; the places then are those of the history before.
+        log_weights = cloud.weights.log()
+    places = cloud.positions[_spread_choice(log_weights, settings.places, generator)]
+    followed, _ = climb(target, places, 1)
+    return followed, len(gain) + climbing_cost(len(places), 1)
 
 
 def _spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices drawn by weight, none of which may take more than a small share."""
-    weights = normalise_log_weights(log_weights)
-    for _ in range(30):
-        weights = weights.clamp_max(1.0 / _FEWEST_CENTRES)
-        weights = weights / weights.sum()
+    weights = cut_off(_weights(log_weights), _FEWEST_PLACES)
     return torch.multinomial(weights, count, replacement=True, generator=generator)

@@ -27,8 +27,8 @@ class Measured(NamedTuple):
     """What is known and asked of m particles over n transitions.
 
     `poses` (n + 1, 3) and their `variance`; values and `slopes` (n, j) of the bumps; `rest`
-    (n) what the terms after each one can still add; `least` (m) what must be reached with the
-    last term at `temperature`; `sd` (m) of the misfit; `limit` of an innovation's square.
+    (n) what the terms after each one can still add; `least` (m) what must be reached; `sd` (m) of
+    the misfit; `limit` of an innovation's square.
     """
 
     poses: np.ndarray
@@ -37,19 +37,17 @@ class Measured(NamedTuple):
     slopes: np.ndarray
     rest: np.ndarray
     least: np.ndarray
-    temperature: float
     sd: np.ndarray
     limit: float
 
 
 class Found(NamedTuple):
-    """Where the answers go: log likelihoods (m), field mean (m, c) and covariance (m, c, c),
+    """Where the answers go: log likelihood (m), field mean (m, c) and covariance (m, c, c),
     innovations and the logarithms of their units (m, n, 3) where they are asked for (else m = 0),
     and derivatives (m, d, n, 3) of the innovations by d entries of theta.
     """
 
     total: np.ndarray
-    before: np.ndarray
     mean: np.ndarray
     covariance: np.ndarray
     jammed: np.ndarray
@@ -125,12 +123,12 @@ def _explain_range(world, law, request, measured, by_theta, found, first, last):
         request.follow_path,
     )
     for i in range(first, last):
-        found.total[i] = found.before[i] = -np.inf
+        found.total[i] = -np.inf
         if not math.isfinite(measured.sd[i]) or not measured.least[i] < np.inf:
             continue
         extent = prepare(world, i, law, request, 0, steps, chains)
         _begin(state, measured, measured.sd[i])
-        before = total = 0.0
+        total = 0.0
         for k in range(steps):
             for a in range(3):
                 starts[k, a] = measured.poses[k, a] - state.mean[size + a]
@@ -140,21 +138,18 @@ def _explain_range(world, law, request, measured, by_theta, found, first, last):
             if answer.statuses[k] == RELAXED:
                 found.jammed[i] = True
                 break
-            before = total
             total += _assimilate(state, measured, answer, k, measured.sd[i])
             if found.whitened.shape[0] > 0 and math.isfinite(total):
                 for a in range(3):
                     found.whitened[i, k, a] = state.innovation[a]
                     found.log_scale[i, k, a] = math.log(state.factor[a, a])
                 _follow(state, slopes.theta, found.slopes, i, k, size)
-            share = measured.temperature if k == steps - 1 else 1.0
-            reach = before + share * (total - before) + measured.rest[k]
-            if not (reach >= measured.least[i] and math.isfinite(total)):
-                before = total = -np.inf
+            if not (total + measured.rest[k] >= measured.least[i] and math.isfinite(total)):
+                total = -np.inf
                 break
         if found.jammed[i]:
             continue
-        found.total[i], found.before[i] = total, before
+        found.total[i] = total
         for a in range(size):
             found.mean[i, a] = state.mean[a]
             for b in range(size):

@@ -99,8 +99,8 @@ def estimate_paper(
 
     The episode's own priors replace the defaults; the latent is uniform where the shape
     model calls it valid. Beliefs carry no misfit field and no evidence (NaN). In `info`,
-    `temperatures` counts resamplings (0 or 1), and a distinct ancestor is a particle of the
-    step before that has descendants. With the `state` of an earlier step it goes on after
+    `rounds` counts resamplings (0 or 1), and `distinct` the particles of the step before that
+    have descendants. With the `state` of an earlier step it goes on after
     that step. Raises ValueError where no particle explains the data.
     """
     settings = settings or PaperSettings()
@@ -125,12 +125,11 @@ def estimate_paper(
             weights = torch.full((count,), 1.0 / count, dtype=torch.float64)
         log_weights = weights.log()
         info = CloudInfo(
-            temperatures=int(resampled),
-            moves=0,
-            acceptance_independent=0.0,
-            acceptance_local=0.0,
+            rounds=int(resampled),
+            draws=0,
             effective_sample_size=effective,
-            distinct_ancestors=int(ancestors.unique().numel()),
+            tail_shape=math.nan,
+            distinct=int(ancestors.unique().numel()),
             evaluations=count,
         )
         belief = _belief(prior, vectors, weights, episode, settings)

@@ -83,6 +83,22 @@ class ParameterPrior:
         latent = self.to_vector(score)[..., :z]
         return normal + self.shape.log_density(latent) + z * math.log(2.0)
 
+    def curvature(
+        self, score: Float[Tensor, "*batch d"]
+    ) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d d"]]:
+        """Gradient of the log prior density in the unconstrained coordinates, within the valid
+        shapes, and a precision, positive definite, that bounds its curvature."""
+        precision = torch.eye(self.dimension, dtype=score.dtype).repeat(*score.shape[:-1], 1, 1)
+        gradient = -score
+        z = self.shape.latent_dim
+        if z:
+            vector, slope = self.to_vector_with_slope(score)
+            slope = slope[..., :z]
+            rise, own = self.shape.latent_curvature(vector[..., :z])
+            gradient = torch.cat((gradient[..., :z] + slope * rise, gradient[..., z:]), dim=-1)
+            precision[..., :z, :z] += slope[..., :, None] * own * slope[..., None, :]
+        return gradient, precision
+
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count d"]:
         """Draw unconstrained coordinates from the prior."""
         score = torch.randn(count, self.dimension, generator=generator, dtype=torch.float64)

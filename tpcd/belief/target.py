@@ -12,19 +12,17 @@ from torch import Tensor
 from tpcd.belief.history import History
 from tpcd.belief.likelihood import (
     HistoryLikelihood,
-    Threshold,
     history_likelihood,
-    linearised_likelihood,
 )
+from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.simulator import StepSettings, native
 
-_PRIOR_DRAWS = 2000
-_DIFFERENCE = 0.05
-"""Step of the differences, in standard deviations of the particles: well over the kinks of a
-contact, well under what is left to learn."""
-_LARGEST_DIFFERENCE = 0.05
+_LARGE_MISFIT = 2.0
+"""Added to the score of the misfit's size."""
+_DIFFERENCE = 0.01
+"""Step of differences, in standard deviations of the prior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +32,6 @@ class ContactTarget:
     prior: ParameterPrior
     misfit: MisfitField
     step: StepSettings
-    prior_mean: Float[Tensor, " s"]
-    prior_precision: Float[Tensor, "s s"]
-    """Normal fit of the prior, for proposals only."""
     history: History | None = None
 
     def given(self, history: History) -> ContactTarget:
@@ -45,7 +40,16 @@ class ContactTarget:
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "m s"]:
         """Draws from the prior."""
-        return _draw(self.prior, count, generator)
+        score = self.prior.sample(count, generator)
+        misfit = torch.randn(count, 1, generator=generator, dtype=torch.float64)
+        return torch.cat((score, misfit), dim=-1)
+
+    def scatter(self, count: int, generator: torch.Generator) -> Float[Tensor, "m s"]:
+        """Draws from the prior, every other one with a large misfit: the larger it is, the
+        smoother the posterior is to climb, as at a higher temperature."""
+        score = self.sample(count, generator)
+        score[::2, -1] += _LARGE_MISFIT
+        return score
 
     def log_prior(self, score: Float[Tensor, "m s"]) -> Float[Tensor, " m"]:
         """Log density of the prior."""
@@ -53,46 +57,42 @@ class ContactTarget:
         return self.prior.log_density(score[:, :-1]) + normal
 
     def log_likelihood(
-        self, score: Float[Tensor, "m s"], threshold: Threshold | None
-    ) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-        """Log likelihood of all transitions but the last, and of all."""
-        found = self.evaluate(score, threshold)
-        return found.before, found.total
+        self, score: Float[Tensor, "m s"], least: Float[Tensor, " m"] | None
+    ) -> Float[Tensor, " m"]:
+        """Log likelihood of the history; -inf where it may stay below `least`."""
+        return self.evaluate(score, least).total
 
     def curvature(
-        self, score: Float[Tensor, "m s"], spread: Float[Tensor, " s"], temperature: float
+        self, score: Float[Tensor, "m s"]
     ) -> tuple[Float[Tensor, "m s"], Float[Tensor, "m s s"]]:
-        """Gradient of the log posterior with the last transition tempered, and its Fisher
-        information, from the derivatives of the innovations; `spread` is that of the particles.
+        """Gradient of the log posterior and its Fisher information, from the derivatives of
+        the innovations.
 
-        Of the prior its normal fit is taken. Entries that cannot be evaluated count as flat.
+        Entries that cannot be evaluated count as flat.
         """
-        found = self._linearised(score, spread)
-        share = score.new_ones(found.whitened.shape[1], 1)
-        share[-1] = temperature
-        root = share.sqrt()
-        here = torch.nan_to_num(root * found.whitened).flatten(1)
-        slopes = torch.nan_to_num(root * found.slopes, 0.0, 0.0, 0.0).flatten(2)
-        stretch = torch.nan_to_num(root * found.stretch, 0.0, 0.0, 0.0).flatten(2)
-        prior = (self.prior_mean - score) @ self.prior_precision
-        gradient = prior - (slopes @ here[..., None])[..., 0]
-        gradient = gradient - stretch @ root.expand(-1, 3).flatten()
-        information = self.prior_precision + slopes @ slopes.mT + 2 * stretch @ stretch.mT
-        return gradient, information
+        found = self._linearised(score)
+        here = torch.nan_to_num(found.whitened).flatten(1)
+        slopes = torch.nan_to_num(found.slopes, 0.0, 0.0, 0.0).flatten(2)
+        stretch = torch.nan_to_num(found.stretch, 0.0, 0.0, 0.0).flatten(2)
+        gradient = -(slopes @ here[..., None])[..., 0] - stretch.sum(-1)
+        information = slopes @ slopes.mT + 2 * stretch @ stretch.mT
+        rise, precision = self.prior.curvature(score[:, :-1])
+        information[:, :-1, :-1] += precision
+        information[:, -1, -1] += 1.0
+        return gradient + torch.cat((rise, -score[:, -1:]), dim=-1), information
 
-    def _linearised(self, score: Tensor, spread: Tensor) -> _Linearised:
+    def _linearised(self, score: Tensor) -> _Linearised:
         """Innovations and their derivatives: compiled for theta and by a difference for the
         size of the misfit; by differences throughout where compiled loops are not to be had."""
         s = score.shape[-1]
-        steps = (_DIFFERENCE * spread).clamp(1e-6, _LARGEST_DIFFERENCE)
         if not native.available() or score.device.type != "cpu":
-            moved = score + torch.cat((score.new_zeros(1, s), torch.diag(steps)))[:, None]
+            steps = torch.diag(score.new_full((s,), _DIFFERENCE))
+            moved = score + torch.cat((score.new_zeros(1, s), steps))[:, None]
             found = self.evaluate(moved.flatten(0, 1), innovations=True)
             parts = (found.whitened, found.log_scale)
             whitened, log_scale = (_known(p).unflatten(0, (s + 1, -1)) for p in parts)
             slopes, stretch = (
-                ((v[1:] - v[0]) / steps[:, None, None, None]).movedim(0, 1)
-                for v in (whitened, log_scale)
+                ((v[1:] - v[0]) / _DIFFERENCE).movedim(0, 1) for v in (whitened, log_scale)
             )
             return _Linearised(whitened[0], slopes, stretch)
         assert self.history is not None
@@ -106,10 +106,10 @@ class ContactTarget:
             self.misfit,
             self.step,
         )
-        moved = score + torch.cat((score.new_zeros(s - 1), steps[-1:]))
+        moved = score + torch.cat((score.new_zeros(s - 1), score.new_full((1,), _DIFFERENCE)))
         there = self.evaluate(moved, innovations=True)
         last, stretch = (
-            (_known(b) - _known(a)) / steps[-1]
+            (_known(b) - _known(a)) / _DIFFERENCE
             for a, b in ((here.whitened, there.whitened), (here.log_scale, there.log_scale))
         )
         slopes = torch.cat((_known(here.slopes), last[:, None]), dim=1)
@@ -119,7 +119,7 @@ class ContactTarget:
     def evaluate(
         self,
         score: Float[Tensor, "m s"],
-        threshold: Threshold | None = None,
+        least: Float[Tensor, " m"] | None = None,
         innovations: bool = False,
     ) -> HistoryLikelihood:
         """What the particles say about the history."""
@@ -131,7 +131,7 @@ class ContactTarget:
             self.history,
             self.misfit,
             self.step,
-            threshold,
+            least,
             innovations,
         )
 
@@ -145,19 +145,6 @@ class _Linearised:
     stretch: Tensor
 
 
-def contact_target(prior: ParameterPrior, misfit: MisfitField, step: StepSettings) -> ContactTarget:
-    """The target before any datum."""
-    draws = _draw(prior, _PRIOR_DRAWS, torch.Generator().manual_seed(0))
-    precision = torch.linalg.inv(torch.cov(draws.T))
-    return ContactTarget(prior, misfit, step, draws.mean(0), precision)
-
-
 def _known(value: Tensor | None) -> Tensor:
     assert value is not None
     return value
-
-
-def _draw(prior: ParameterPrior, count: int, generator: torch.Generator) -> Tensor:
-    score = prior.sample(count, generator)
-    misfit = torch.randn(count, 1, generator=generator, dtype=torch.float64)
-    return torch.cat((score, misfit), dim=-1)

@@ -169,6 +169,13 @@ class DeepSDFShape:
         """Log of the normalised prior density of the latent; -inf where not valid."""
         return self.density.log_density(latent)
 
+    def latent_curvature(
+        self, latent: Float[Tensor, "*batch z"]
+    ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
+        """Gradient of the log density within the valid region, and a precision, positive
+        semi-definite, that bounds its curvature."""
+        return self.density.curvature(latent)
+
     def sample_latent(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
         """Draw valid latents from the prior, float64 on the CPU."""
         return self.density.sample(count, generator)

@@ -29,6 +29,13 @@ class LatentDensity(Protocol):
         """Log density, normalised on the valid region; -inf elsewhere."""
         ...
 
+    def curvature(
+        self, latent: Float[Tensor, "*batch z"]
+    ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
+        """Gradient of the log density within the valid region, and a precision, positive
+        semi-definite, that bounds its curvature."""
+        ...
+
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
         """Independent draws, float64 on the CPU."""
         ...
@@ -58,6 +65,13 @@ class MaskDensity:
         area = 4.0 * self.cells.double().mean().item()
         level = torch.full_like(latent[..., 0], -math.log(area))
         return torch.where(self.valid(latent), level, torch.full_like(level, -torch.inf))
+
+    def curvature(
+        self, latent: Float[Tensor, "*batch z"]
+    ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
+        """Flat."""
+        z = latent.shape[-1]
+        return torch.zeros_like(latent), latent.new_zeros(*latent.shape, z)
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
         """Uniform draws: a valid cell, then a place within it."""
@@ -95,6 +109,26 @@ class MixtureDensity:
 
     def raw_log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
         """Log density of the untruncated mixture."""
+        parts, _, _ = self._parts(latent)
+        return torch.logsumexp(parts, dim=-1).reshape(latent.shape[:-1]).to(latent.dtype)
+
+    def curvature(
+        self, latent: Float[Tensor, "*batch z"]
+    ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
+        """Gradient of the log density, and the mean of the components' precisions by the share
+        that each has in the density here. The curvature is that less the spread of the
+        components' gradients."""
+        z = latent.shape[-1]
+        parts, precision, linear = self._parts(latent)
+        share = parts.softmax(-1)
+        mean = (share @ precision.flatten(1)).unflatten(-1, (z, z))
+        gradient = share @ linear - (mean @ latent.reshape(-1, z, 1).double())[..., 0]
+        mean = mean.reshape(*latent.shape, z).to(latent.dtype)
+        return gradient.reshape(latent.shape).to(latent.dtype), mean
+
+    def _parts(self, latent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log density (m, k) of each weighted component at the flattened latents, and the
+        components' precisions P and P m."""
         z = latent.shape[-1]
         means, factors = self.means.to(latent.device), self.factors.to(latent.device)
         # (x - m)' P (x - m) = x' P x - 2 m' P x + m' P m for all components by two matrix
@@ -109,7 +143,7 @@ class MixtureDensity:
         )
         products = (flat[:, :, None] * flat[:, None, :]).flatten(1)
         parts = log_scale + flat @ linear.mT - 0.5 * products @ precision.flatten(1).mT
-        return torch.logsumexp(parts, dim=-1).reshape(latent.shape[:-1]).to(latent.dtype)
+        return parts, precision, linear
 
     def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
         """Whether the latent lies in the box and above the density floor."""

@@ -87,6 +87,12 @@ class PolygonShape:
         """Zero: the only latent has probability one."""
         return torch.zeros(latent.shape[:-1], dtype=latent.dtype, device=latent.device)
 
+    def latent_curvature(
+        self, latent: Float[Tensor, "*batch z"]
+    ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
+        """Of a latent of size zero."""
+        return torch.zeros_like(latent), latent.new_zeros(*latent.shape, latent.shape[-1])
+
     def sample_latent(self, count: int, generator: torch.Generator) -> Float64[Tensor, "count z"]:
         """Latents of size zero (count, 0), float64 on the CPU."""
         return torch.zeros((count, 0), dtype=torch.float64)

@@ -51,6 +51,13 @@ class Shape(Protocol):
         """Log of the normalised prior density of the latent; -inf where not valid."""
         ...
 
+    def latent_curvature(
+        self, latent: Float[Tensor, "*batch z"]
+    ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
+        """Gradient of the log density within the valid region, and a precision, positive
+        semi-definite, that bounds its curvature."""
+        ...
+
     def sample_latent(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
         """Draw valid latents from the prior, float64 on the CPU."""
         ...

@@ -1,0 +1,71 @@
+"""A linear-normal model with known posterior and evidence, and targets made of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+DIMENSION = 3
+NOISE = 0.3
+Likelihood = Callable[[Tensor], Tensor]
+
+
+class LinearModel:
+    """y_k = a_k . x + noise with x ~ N(0, I): everything about it is known."""
+
+    def __init__(self, count: int, seed: int = 0) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        self.rows = torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+        truth = torch.randn(DIMENSION, generator=generator, dtype=torch.float64)
+        noise = torch.randn(count, generator=generator, dtype=torch.float64)
+        self.data = self.rows @ truth + NOISE * noise
+
+    def target(self, count: int, likelihood: Likelihood | None = None) -> LinearTarget:
+        """The posterior of the first data, or of another likelihood."""
+
+        def known(x: Tensor) -> Tensor:
+            error = (self.data[:count] - x @ self.rows[:count].T) / NOISE
+            each = -0.5 * error**2 - math.log(NOISE) - 0.5 * math.log(2 * math.pi)
+            return each.sum(-1)
+
+        return LinearTarget(self, count, likelihood or known)
+
+    def posterior(self, count: int) -> tuple[Tensor, Tensor, float]:
+        """Mean, covariance and log evidence."""
+        rows, data = self.rows[:count], self.data[:count]
+        precision = torch.eye(DIMENSION, dtype=torch.float64) + rows.T @ rows / NOISE**2
+        covariance = torch.linalg.inv(precision)
+        marginal = rows @ rows.T + NOISE**2 * torch.eye(count, dtype=torch.float64)
+        evidence = torch.distributions.MultivariateNormal(torch.zeros_like(data), marginal)
+        return covariance @ rows.T @ data / NOISE**2, covariance, float(evidence.log_prob(data))
+
+
+@dataclass(frozen=True)
+class LinearTarget:
+    """The first data of a model, or another likelihood in their place."""
+
+    model: LinearModel
+    count: int
+    likelihood: Likelihood
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        return torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+
+    def scatter(self, count: int, generator: torch.Generator) -> Tensor:
+        return self.sample(count, generator)
+
+    def log_prior(self, x: Tensor) -> Tensor:
+        return -0.5 * (x**2).sum(-1) - 0.5 * DIMENSION * math.log(2 * math.pi)
+
+    def log_likelihood(self, x: Tensor, least: Tensor | None) -> Tensor:
+        return self.likelihood(x)
+
+    def curvature(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        rows, data = self.model.rows[: self.count], self.model.data[: self.count]
+        gradient = (data - x @ rows.T) @ rows / NOISE**2 - x
+        information = torch.eye(DIMENSION).double() + rows.T @ rows / NOISE**2
+        return gradient, information.expand(len(x), -1, -1)

@@ -1,0 +1,97 @@
+"""Climbing to modes, and the share that each gets, on targets with known answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tpcd.belief.cloud import SamplerSettings, start_cloud
+from tpcd.belief.importance import draw_pool
+from tpcd.belief.modes import climb, climb_with_the_best, climbing_cost, find_modes, log_target
+
+DIMENSION = 2
+CENTRES = torch.tensor([[2.0, 0.0], [-2.0, 1.0], [0.0, -3.0]], dtype=torch.float64)
+SHARES = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
+WIDTH = 0.1
+NONE = torch.zeros(0, DIMENSION, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class ThreeModes:
+    """A likelihood of three narrow normals of known shares, under a flat enough prior."""
+
+    prior_std: float = 3.0
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        normal = torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+        return self.prior_std * normal
+
+    def scatter(self, count: int, generator: torch.Generator) -> Tensor:
+        return self.sample(count, generator)
+
+    def log_prior(self, x: Tensor) -> Tensor:
+        square = (x**2).sum(-1) / self.prior_std**2
+        return -0.5 * square - DIMENSION * math.log(self.prior_std * math.sqrt(2 * math.pi))
+
+    def log_likelihood(self, x: Tensor, least: Tensor | None) -> Tensor:
+        square = ((x[:, None] - CENTRES) ** 2).sum(-1) / WIDTH**2
+        # Shares of the posterior, so the prior at the centres is taken out.
+        terms = SHARES.log() - self.log_prior(CENTRES) - 0.5 * square
+        return torch.logsumexp(terms, -1) - math.log(2 * math.pi * WIDTH**2)
+
+    def curvature(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        nearest = ((x[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
+        gradient = (CENTRES[nearest] - x) / WIDTH**2
+        return gradient, torch.eye(DIMENSION).double().expand(len(x), -1, -1) / WIDTH**2
+
+
+def test_a_climb_gains_at_every_step_and_arrives() -> None:
+    target = ThreeModes()
+    start = target.sample(50, torch.Generator().manual_seed(0))
+    heights = [log_target(target, start)]
+    for rounds in (1, 2, 4, 8):
+        points, height = climb(target, start, rounds)
+        assert (height >= heights[-1]).all()
+        heights.append(height)
+    assert ((points[:, None] - CENTRES).norm(dim=-1).amin(-1) < 0.01).all()
+
+
+def test_the_lower_half_gives_up_until_as_many_are_left_as_may_be_kept() -> None:
+    target = ThreeModes()
+    start = target.sample(40, torch.Generator().manual_seed(0))
+    settings = SamplerSettings(modes=10, climbing_rounds=0)
+    best, evaluations = climb_with_the_best(target, start, settings)
+    height = log_target(target, start)
+    torch.testing.assert_close(best, start[height.argsort(descending=True)[:10]])
+    assert evaluations == climbing_cost(40, 0) + climbing_cost(20, 0) == 60
+    all_kept, evaluations = climb_with_the_best(target, start[:10], settings)
+    torch.testing.assert_close(all_kept, start[:10])
+    assert evaluations == 0
+
+
+def test_each_mode_is_found_once_and_remembered() -> None:
+    target, generator = ThreeModes(), torch.Generator().manual_seed(1)
+    settings = SamplerSettings(fresh_modes=60, modes=60, climbing_rounds=6)
+    peaks = find_modes(target, NONE, settings, generator)
+    assert len(peaks.points) == 3
+    assert (torch.cdist(CENTRES, peaks.points).amin(-1) < 0.01).all()
+    one = SamplerSettings(fresh_modes=1, modes=10)
+    again = find_modes(target, peaks.points, one, generator)
+    torch.testing.assert_close(again.points, peaks.points, atol=1e-3, rtol=0)
+
+
+def test_a_cloud_in_one_mode_still_gives_all_modes_their_share_and_the_evidence() -> None:
+    target, generator = ThreeModes(), torch.Generator().manual_seed(2)
+    normal = torch.randn(400, 2, generator=generator, dtype=torch.float64)
+    cloud = start_cloud(CENTRES[0] + WIDTH * normal)
+    settings = SamplerSettings(fresh_modes=60, modes=30, wanted=2000.0)
+    pool = draw_pool(cloud, target, 1, settings, generator)
+    nearest = ((pool.positions[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
+    weights = pool.log_weights.softmax(0)
+    share = torch.zeros(3, dtype=torch.float64).index_add(0, nearest, weights)
+    torch.testing.assert_close(share, SHARES, atol=0.05, rtol=0)
+    # The prior varies a little within a mode: by less than 1 % of its height.
+    assert abs(pool.log_evidence) < 4 * pool.log_evidence_std + 0.01

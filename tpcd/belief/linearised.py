@@ -1,0 +1,60 @@
+"""The history likelihood with derivatives of its innovations, for Newton steps and proposals."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.belief.history import History
+from tpcd.belief.likelihood import HistoryLikelihood, compiled_likelihood
+from tpcd.belief.misfit import MisfitField
+from tpcd.contact import place_points, scene_from_parameters
+from tpcd.parameters import Parameters
+from tpcd.shape.protocol import Shape
+from tpcd.simulator import StepSettings, native
+
+_DIFFERENCE = 1e-3
+"""Difference of a coordinate by which a scene moves for its derivatives."""
+
+
+def linearised_likelihood(
+    shape: Shape,
+    vectors: Float[Tensor, "m d"],
+    slopes: Float[Tensor, "m d"],
+    misfit_sd: Float[Tensor, " m"],
+    history: History,
+    field: MisfitField,
+    settings: StepSettings,
+) -> HistoryLikelihood:
+    """The likelihood with the derivatives of its innovations by d coordinates, in compiled loops.
+
+    `vectors` are theta, and `slopes` the derivatives of each entry by its own coordinate. The
+    scene moves by differences, the settled poses by the derivatives of the rest equations,
+    and the filter at a fixed gain (Gauss-Newton). NaN where a particle jams.
+    """
+    from tpcd.simulator.kernel_slopes import SceneSlopes
+
+    m, d = vectors.shape
+    z = shape.latent_dim
+    steps = torch.diag(torch.full((d,), _DIFFERENCE, dtype=vectors.dtype))
+    moved = torch.cat((vectors[None], vectors + steps[:, None] * slopes))
+    decoded = Parameters.from_vector(moved[: z + 1].flatten(0, 1)).latent
+    points = native.decode(shape, decoded).unflatten(0, (z + 1, m))
+    points = torch.cat((points, points[:1].expand(d - z, -1, -1, -1)))
+    parameters = Parameters.from_vector(moved)
+    world = native.world_of(
+        scene_from_parameters(
+            shape, parameters, place_points(points, parameters.scale, parameters.mount)
+        )
+    )
+    parts = []
+    for flat in (world.points, world.offsets, world.friction):
+        value = flat.reshape(d + 1, m, *flat.shape[1:])
+        parts.append(np.ascontiguousarray((value[1:] - value[0]).swapaxes(0, 1)) / _DIFFERENCE)
+    first = Parameters.from_vector(vectors)
+    scene = scene_from_parameters(shape, first, place_points(points[0], first.scale, first.mount))
+    return compiled_likelihood(
+        scene, misfit_sd, history, field, settings, None, True, SceneSlopes(*parts)
+    )

@@ -1,0 +1,75 @@
+"""Sum of Student densities in compiled loops; see `proposals`. Imported only where numba is."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from tpcd.simulator.kernel import source_stamp
+
+
+class Components(NamedTuple):
+    """t components at each of k places in d dimensions: axes (d, d, k), coordinates `place`
+    (d, k) of the places along them, `offset` of the centres and inverse spreads `sharpness`
+    (t, d, k), and peak densities (t, k) up to a factor."""
+
+    axes: np.ndarray
+    place: np.ndarray
+    offset: np.ndarray
+    sharpness: np.ndarray
+    peak: np.ndarray
+
+
+def _compile_sum_range(stamp: int) -> Callable[..., None]:
+    """The entry, the only function kept in numba's cache; `stamp` makes part of its key."""
+
+    # Sums may be taken in another order, so that they run in vector registers; NaN and
+    # infinity keep their meaning.
+    @njit(
+        cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}
+    )
+    @no_type_check
+    def sum_range(points, components, freedom, total, first, last):
+        sizes, dimension, places = components.offset.shape
+        power = freedom + dimension if stamp >= 0 else 0
+        along, value = np.empty(places), np.empty(places)
+        square = np.empty((sizes, places))
+        for i in range(first, last):
+            square[:] = 0.0
+            for a in range(dimension):
+                for k in range(places):
+                    along[k] = -components.place[a, k]
+                for b in range(dimension):
+                    coordinate = points[i, b]
+                    for k in range(places):
+                        along[k] += components.axes[a, b, k] * coordinate
+                for t in range(sizes):
+                    for k in range(places):
+                        scaled = along[k] - components.offset[t, a, k]
+                        scaled *= components.sharpness[t, a, k]
+                        square[t, k] += scaled * scaled
+            # (1 + square / freedom)^(-power / 2) without logarithms: power is a whole number.
+            for t in range(sizes):
+                for k in range(places):
+                    square[t, k] = 1.0 / (1.0 + square[t, k] / freedom)
+                for k in range(places):
+                    value[k] = math.sqrt(square[t, k]) if power % 2 else 1.0
+                for _ in range(power // 2):
+                    for k in range(places):
+                        value[k] *= square[t, k]
+                whole = 0.0
+                for k in range(places):
+                    whole += value[k] * components.peak[t, k]
+                total[i, t] = whole
+
+    return sum_range
+
+
+sum_range = _compile_sum_range(source_stamp(sys.modules[__name__]))
+"""Fill `total` (m, t) of points (m, d) `first` up to `last` with the sum of the densities over all
+places, up to a factor: (points, components, freedom, total, first, last)."""

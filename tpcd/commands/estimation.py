@@ -8,6 +8,7 @@ The folder holds `belief.*` and `state.safetensors` (saved after every step), `s
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,6 +155,7 @@ def _step_row(step: EstimationStep, learnt: str) -> dict[str, Any]:
         "seconds": step.seconds,
         "learnt_most": learnt,
         "effective_sample_size": float(step.info.effective_sample_size),
+        "tail_shape": step.info.tail_shape if math.isfinite(step.info.tail_shape) else None,
         "log_evidence": belief.log_evidence,
         "mean": belief.mean().tolist(),
         "low": belief.quantile(0.05).tolist(),
@@ -164,6 +166,8 @@ def _step_row(step: EstimationStep, learnt: str) -> dict[str, Any]:
 def _log_scalars(writer: Any, row: dict[str, Any], step: EstimationStep) -> None:
     writer.add_scalar("sampler/effective_sample_size", row["effective_sample_size"], step.index)
     writer.add_scalar("sampler/seconds", step.seconds, step.index)
+    if row["tail_shape"] is not None:
+        writer.add_scalar("sampler/tail_shape", row["tail_shape"], step.index)
     writer.add_scalar("sampler/log_evidence", row["log_evidence"], step.index)
     for name, mean, std in zip(
         step.belief.prior.names, step.belief.mean(), step.belief.std(), strict=True

@@ -102,3 +102,24 @@ def test_a_belief_of_another_controller_is_refused(
     assert code == 2
     assert "stiffness" in capsys.readouterr().err
     assert not (tmp_path / "p.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("size", "shape", "told"),
+    [
+        (500.0, 0.4, ""),
+        (500.0, None, ""),
+        (500.0, 1.2, "1.2"),
+        (3.0, 0.4, "of 3"),
+        (3.0, None, "of 3"),
+    ],
+)
+def test_a_belief_that_few_draws_carry_is_warned_of(
+    size: float, shape: float | None, told: str
+) -> None:
+    from tpcd.commands.estimation import few_draws_warning
+
+    row = {"step": 7, "effective_sample_size": size, "tail_shape": shape}
+    warning = few_draws_warning(row)
+    assert (warning is not None) == bool(told)
+    assert told in (warning or "")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,10 @@ STILL_PRIOR = 0.85
 """A 90 % interval wider than this share of the prior's counts as nothing learnt."""
 OUTLINES_DRAWN = 200
 STEPS_FILE = "steps.jsonl"
+FEW_DRAWS = 10
+"""Effective sample size under which a belief is not to be trusted."""
+HEAVY_TAIL = 0.7
+"""Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +90,25 @@ def run_estimation(
         if belief is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
         write_json(folder / "summary.json", summarise(belief))
+        warning = few_draws_warning(history[-1])
+        if warning is not None:
+            bar.write(warning, file=sys.stderr)
         _draw(belief, history, episode, figures, writer, truth)
     return belief
+
+
+def few_draws_warning(row: dict[str, Any]) -> str | None:
+    """One line that says how few draws carry the belief after a step; None where enough do."""
+    size, shape = row["effective_sample_size"], row["tail_shape"]
+    if size >= FEW_DRAWS and (shape is None or shape <= HEAVY_TAIL):
+        return None
+    tail = (
+        "" if shape is None else f" and a tail shape of {shape:.1f} (reliable up to {HEAVY_TAIL})"
+    )
+    return (
+        f"warning: few draws carry the belief after step {row['step']}, with an effective sample "
+        f"size of {size:.0f}{tail}: intervals of theta may be too narrow; compare other seeds"
+    )
 
 
 def _earlier_rows(path: Path, done: int) -> list[dict[str, Any]]:

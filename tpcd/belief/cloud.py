@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -11,9 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.proposals import DAMPINGS
-
-LogDensity = Callable[[Tensor], Tensor]
-"""Coordinates (m, d) to log density (m)."""
 
 
 @runtime_checkable

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from tpcd.belief.cloud import SamplerSettings, Target
 
+CURVATURE_COST = 3
+"""Evaluations that gradient and information cost together."""
 _SAME_MODE = 4.0
 """Squared distance, in the metric of the information, within which two modes are one."""
 
@@ -87,10 +89,6 @@ def climb(
         height = torch.where(better, found, height)
         damping = torch.where(better, 0.2 * damping, 5.0 * damping)
     return points, height
-
-
-CURVATURE_COST = 3
-"""Evaluations that gradient and information cost together."""
 
 
 def climbing_cost(points: int, rounds: int) -> int:

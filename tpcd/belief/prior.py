@@ -88,7 +88,8 @@ class ParameterPrior:
     ) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d d"]]:
         """Gradient of the log prior density in the unconstrained coordinates, within the valid
         shapes, and a precision, positive definite, that bounds its curvature."""
-        precision = torch.eye(self.dimension, dtype=score.dtype).repeat(*score.shape[:-1], 1, 1)
+        precision = torch.eye(self.dimension, dtype=score.dtype, device=score.device)
+        precision = precision.repeat(*score.shape[:-1], 1, 1)
         gradient = -score
         z = self.shape.latent_dim
         if z:

@@ -69,7 +69,7 @@ class MaskDensity:
     def curvature(
         self, latent: Float[Tensor, "*batch z"]
     ) -> tuple[Float[Tensor, "*batch z"], Float[Tensor, "*batch z z"]]:
-        """Flat."""
+        """Zero gradient and precision: the density is flat where it is positive."""
         z = latent.shape[-1]
         return torch.zeros_like(latent), latent.new_zeros(*latent.shape, z)
 

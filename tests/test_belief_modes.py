@@ -87,7 +87,7 @@ def test_a_cloud_in_one_mode_still_gives_all_modes_their_share_and_the_evidence(
     target, generator = ThreeModes(), torch.Generator().manual_seed(2)
     normal = torch.randn(400, 2, generator=generator, dtype=torch.float64)
     cloud = start_cloud(CENTRES[0] + WIDTH * normal)
-    settings = SamplerSettings(fresh_modes=60, modes=30, wanted=2000.0)
+    settings = SamplerSettings(fresh_modes=60, modes=30, draws=6000)
     pool = draw_pool(cloud, target, 1, settings, generator)
     nearest = ((pool.positions[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
     weights = pool.log_weights.softmax(0)

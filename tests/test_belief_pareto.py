@@ -1,4 +1,4 @@
-"""Pareto-smoothed weights: the fit against known distributions, and laws of the smoothing."""
+"""The tail of importance weights: the fit against known distributions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from tpcd.belief.pareto import fit_pareto, smooth_weights
+from tpcd.belief.pareto import fit_pareto, tail_shape
 
 
 def log_weights(count: int, shape: float, seed: int = 0) -> torch.Tensor:
@@ -26,40 +26,16 @@ def test_the_fit_recovers_a_generalised_pareto_distribution(shape: float) -> Non
     assert scale == pytest.approx(2.0, rel=0.1)
 
 
-def test_smoothing_keeps_sum_order_and_all_but_the_tail() -> None:
-    given = log_weights(4000, 0.7)
-    weights, shape = smooth_weights(given)
-    plain = given.softmax(0)
-    assert float(weights.sum()) == pytest.approx(1.0)
-    assert 0.4 < shape < 1.0
-    order = plain.argsort()
-    assert (weights[order].diff() >= -1e-15).all()
-    body = order[: -math.ceil(3 * math.sqrt(4000))]
-    ratio = weights[body] / plain[body]
-    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
-    assert float(weights.max()) <= 1.5 * float(plain.max())
+def test_the_shape_of_the_tail_is_found_from_weights() -> None:
+    assert 0.4 < tail_shape(log_weights(4000, 0.7)) < 1.0
+    light = torch.randn(4000, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert tail_shape(0.2 * light) < 0.4
 
 
-def test_smoothed_means_scatter_less_where_the_tail_is_heavy() -> None:
-    """400 samples of 1000 weights of shape 0.8: self-normalised means of an independent normal."""
-    plain, smoothed = [], []
-    for seed in range(400):
-        values = torch.randn(1000, generator=torch.Generator().manual_seed(seed + 1000)).double()
-        given = log_weights(1000, 0.8, seed)
-        plain.append(float(given.softmax(0) @ values))
-        smoothed.append(float(smooth_weights(given)[0] @ values))
-    spread = [float(torch.tensor(v).square().mean().sqrt()) for v in (plain, smoothed)]
-    assert spread[1] < 0.95 * spread[0]
-
-
-def test_even_and_impossible_weights_pass_through() -> None:
-    even, shape = smooth_weights(torch.zeros(50, dtype=torch.float64))
-    torch.testing.assert_close(even, torch.full((50,), 0.02, dtype=torch.float64))
-    assert shape == 0.0
+def test_even_few_and_impossible_weights() -> None:
+    assert tail_shape(torch.zeros(50, dtype=torch.float64)) == 0.0
     few = torch.full((50,), -torch.inf, dtype=torch.float64)
     few[:3] = 0.0
-    weights, shape = smooth_weights(few)
-    assert weights[:3].tolist() == pytest.approx([1 / 3] * 3)
-    assert shape == math.inf
+    assert tail_shape(few) == math.inf
     with pytest.raises(ValueError, match="no particle"):
-        smooth_weights(torch.full((50,), -torch.inf, dtype=torch.float64))
+        tail_shape(torch.full((50,), -torch.inf, dtype=torch.float64))

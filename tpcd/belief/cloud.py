@@ -49,19 +49,15 @@ class SamplerSettings:
     """Places that each round of importance sampling puts components at."""
     draws_per_place: int = 9
     """Draws at each place."""
-    least_rounds: int = 3
-    """Rounds of importance sampling at least."""
-    most_rounds: int = 4
-    """Rounds at most."""
-    wanted: float = 200.0
-    """Effective sample size of the trial draws at which no further round is begun."""
-    draws: int = 6000
+    rounds: int = 3
+    """Rounds of importance sampling that shape the mixture."""
+    draws: int = 3000
     """Draws from the mixture that the rounds arrived at, which are weighted."""
     prior_draws: int = 1500
     """Draws from the prior at the first datum, falling as 1 / k with datum k."""
     modes: int = 20
     """Modes that are remembered from datum to datum."""
-    fresh_modes: int = 240
+    fresh_modes: int = 120
     """Points that set out to climb to a mode at each datum."""
     climbing_rounds: int = 2
     """Newton steps before the lower half of those gives up."""
@@ -74,9 +70,7 @@ class SamplerSettings:
             "particles": 16,
             "places": 1,
             "draws_per_place": 1,
-            "least_rounds": 1,
-            "most_rounds": self.least_rounds,
-            "wanted": 0,
+            "rounds": 1,
             "draws": 100,
             "prior_draws": 1,
             "modes": 1,
@@ -111,7 +105,7 @@ class CloudInfo:
     """What one update of the cloud cost and how good the draws were."""
 
     rounds: int
-    """Rounds of importance sampling; with the paper's filter whether it resampled (0 or 1)."""
+    """Rounds that shaped the mixture; with the paper's filter whether it resampled (0 or 1)."""
     draws: int
     """Draws that were weighted."""
     effective_sample_size: float

@@ -3,8 +3,7 @@
 At each datum, trial draws from a mixture are weighted by the posterior of the whole history.
 The first components sit at modes and at particles of the datum before, a Newton step on; later
 ones where the weight is. All trial draws are weighted under the components of all rounds and
-the prior, which takes part with draws of its own (AMIS: Cornuet et al. 2012), until the
-effective sample size is what is wanted.
+the prior, which takes part with draws of its own (AMIS: Cornuet et al. 2012).
 
 A trial draw that became the centre of a component has made its own density large, and its
 weight too small. So the trial only shapes the mixture: what counts are new draws from it
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, SamplerSettings, Target
 from tpcd.belief.modes import CURVATURE_COST, climb, climbing_cost, find_modes
-from tpcd.belief.pareto import smooth_weights
+from tpcd.belief.pareto import tail_shape
 from tpcd.belief.proposals import CurvedMixture, curved_mixture
 from tpcd.belief.resampling import (
     effective_sample_size,
@@ -51,7 +50,6 @@ class Pool:
     """Where points climbed to, from which the next datum starts."""
     shares: Float[Tensor, " t"]
     """What draws with each damping were worth."""
-    rounds: int
     evaluations: int
 
     @property
@@ -83,7 +81,9 @@ def assimilate(
     Raises ValueError where no particle can explain the datum at all.
     """
     pool = draw_pool(cloud, target, datum, settings, generator)
-    weights, shape = smooth_weights(pool.log_weights)
+    # One draw in a place that the mixture hardly reaches would carry all the weight. A largest
+    # weight of 1 / sqrt(n) costs a bias that vanishes with n (Ionides 2008).
+    weights = cut_off(_weights(pool.log_weights), math.sqrt(len(pool.log_weights)))
     index, counts = systematic_resample(weights, settings.particles, generator).unique(
         return_counts=True
     )
@@ -97,10 +97,10 @@ def assimilate(
         shares=pool.shares,
     )
     info = CloudInfo(
-        rounds=pool.rounds,
+        rounds=settings.rounds,
         draws=len(pool.log_weights),
         effective_sample_size=pool.effective_sample_size,
-        tail_shape=shape,
+        tail_shape=tail_shape(pool.log_weights),
         distinct=len(index),
         evaluations=pool.evaluations,
     )
@@ -127,14 +127,13 @@ def draw_pool(
     )
     evaluations += peaks.evaluations + CURVATURE_COST * len(followed)
     trial = _of_prior(target, max(1, settings.prior_draws // datum), generator)
-    for rounds in range(1, settings.most_rounds + 1):
+    for left in reversed(range(settings.rounds)):
         trial, by_damping = trial.add(target, mixture, generator)
         log_weights = trial.log_weights
         weights = cut_off(_weights(log_weights), math.sqrt(len(log_weights)))
         worth = weights @ by_damping.softmax(-1).nan_to_num(0.0)
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
-        enough = effective_sample_size(weights) >= settings.wanted
-        if rounds == settings.most_rounds or (rounds >= settings.least_rounds and enough):
+        if left == 0:
             break
         centres = trial.positions[_spread_choice(log_weights, settings.places, generator)]
         counts = _counts(shares, settings.draws_per_place)
@@ -142,7 +141,7 @@ def draw_pool(
         evaluations += CURVATURE_COST * len(centres)
     positions, log_likelihood, log_weights = trial.draw(target, settings.draws, generator)
     evaluations += len(trial.positions) + len(positions)
-    return Pool(positions, log_likelihood, log_weights, peaks.points, shares, rounds, evaluations)
+    return Pool(positions, log_likelihood, log_weights, peaks.points, shares, evaluations)
 
 
 def _counts(shares: Tensor, total: int) -> Tensor:

@@ -1,9 +1,8 @@
-"""Weights whose few largest are replaced by what their own distribution expects.
+"""How heavy the tail of importance weights is, and so how far to trust them.
 
 The largest weights of importance sampling are themselves chance. A generalised Pareto
-distribution is fitted to the upper tail and its expected order statistics take the place of
-the weights found (Vehtari, Simpson, Gelman, Yao and Gabry 2024). Its shape k tells how far to
-trust them: below 0.5 the variance of the weights is finite, above 0.7 estimates may be off.
+distribution is fitted to the upper tail. Below a shape k of 0.5 the variance of the weights
+is finite; above 0.7 estimates may be off (Vehtari, Simpson, Gelman, Yao and Gabry 2024).
 """
 
 from __future__ import annotations
@@ -21,34 +20,19 @@ _PRIOR_COUNT, _PRIOR_SHAPE = 10.0, 0.5
 """The shape is drawn towards 0.5 as by so many more weights."""
 
 
-def smooth_weights(
-    log_weights: Float[Tensor, " n"],
-) -> tuple[Float[Tensor, " n"], float]:
-    """Weights that sum to 1, and the shape k of their tail (infinite where too few are positive).
-
-    Raises ValueError as `normalise_log_weights` does.
-    """
+def tail_shape(log_weights: Float[Tensor, " n"]) -> float:
+    """Shape k of the tail of the weights; infinite where too few are positive, 0 where they are
+    even. Raises ValueError as `normalise_log_weights` does."""
     weights = normalise_log_weights(log_weights)
     positive = int((weights > 0).sum())
     count = math.ceil(min(positive / 5, 3 * math.sqrt(positive)))
     if count < _FEWEST_IN_TAIL:
-        return weights, math.inf
-    order = weights.argsort()
-    tail, threshold = order[-count:], weights[order[-count - 1]]
-    excess = weights[tail] - threshold
+        return math.inf
+    order = weights.sort().values
+    excess = order[-count:] - order[-count - 1]
     if not bool(excess[-1] > 0) or not bool(excess[count // 4] > 0):
-        # Even weights have no tail.
-        return weights, 0.0
-    shape, scale = fit_pareto(excess)
-    level = (torch.arange(count, dtype=weights.dtype) + 0.5) / count
-    if abs(shape) < 1e-9:
-        expected = -scale * torch.log1p(-level)
-    else:
-        expected = scale * torch.expm1(-shape * torch.log1p(-level)) / shape
-    smoothed = weights.clone()
-    # No weight may exceed the largest one found.
-    smoothed[tail] = (threshold + expected).clamp_max(float(weights[order[-1]]))
-    return smoothed / smoothed.sum(), shape
+        return 0.0
+    return fit_pareto(excess)[0]
 
 
 def fit_pareto(excess: Float[Tensor, " m"]) -> tuple[float, float]:

@@ -20,12 +20,12 @@ python -m eval.calibration --runs 200 --steps 10 --out runs/calibration
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from eval.lines import append_lines, read_lines, write_line
 from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
@@ -93,12 +93,12 @@ def calibrate(config: Calibration) -> None:
         folder = open_run(config.out, COMMAND, config)
     shape = _shape(config)
     lines_path = folder / RUNS_FILE
-    done = read_lines(lines_path)
+    done = {int(line["seed"]): line for line in read_lines(lines_path)}
     missing = [config.seed + r for r in range(config.runs) if config.seed + r not in done]
-    for seed in tqdm(missing, desc="calibration", unit="run"):
-        done[seed] = {"seed": seed, **_one_run(config, shape, seed)}
-        with lines_path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(done[seed]) + "\n")
+    with append_lines(lines_path) as file:
+        for seed in tqdm(missing, desc="calibration", unit="run"):
+            done[seed] = {"seed": seed, **_one_run(config, shape, seed)}
+            write_line(file, done[seed])
     places = [line["place"] for line in done.values() if "place" in line]
     failed = len(done) - len(places)
     if not places:
@@ -238,23 +238,6 @@ def rank_histograms(places: Sequence[Sequence[float]], names: Sequence[str]) -> 
     for panel in axes[len(names) :]:
         panel.remove()
     return figure
-
-
-def read_lines(path: Path) -> dict[int, dict[str, Any]]:
-    """Runs done so far by seed; a last line that was cut off is dropped, in the file too."""
-    from tpcd.errors import RunError
-
-    if not path.is_file():
-        return {}
-    text = path.read_text(encoding="utf-8")
-    whole, _, rest = text.rpartition("\n")
-    if rest:
-        path.write_text(whole + "\n" if whole else "", encoding="utf-8")
-    try:
-        lines = [json.loads(line) for line in whole.splitlines()]
-        return {int(line["seed"]): line for line in lines}
-    except (ValueError, KeyError, TypeError) as error:
-        raise RunError(path, f"is not a list of runs ({error})", "name a new folder") from error
 
 
 def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:

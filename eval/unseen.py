@@ -11,11 +11,11 @@ goes on where it was.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from eval.lines import append_lines, read_lines, write_line
 from tpcd.cli import check_numbers, run
 
 SEEN = (
@@ -112,16 +112,15 @@ def evaluate_unseen(config: Unseen) -> None:
     else:
         folder = open_run(config.out, "python -m eval.unseen", config, config.overwrite)
     path = folder / "cells.jsonl"
-    cells = _finished(path)
+    cells = read_lines(path)
     plan = [(n, p, s) for s in config.seeds for n in names for p in priors]
     done = {(c["object"], c["prior"], c["seed"]) for c in cells}
-    with path.open("a", encoding="utf-8") as lines:
+    with append_lines(path) as lines:
         for name, prior, seed in tqdm(plan, unit="cell", initial=0):
             if (name, prior, seed) in done:
                 continue
             cell = _cell(config, name, outlines[name].vertices, prior, seed)
-            lines.write(json.dumps(cell) + "\n")
-            lines.flush()
+            write_line(lines, cell)
             cells.append(cell)
     columns = [key for key in cells[0] if key not in ("transform", "theta_score")]
     table = [{key: cell[key] for key in columns} for cell in cells]
@@ -231,18 +230,6 @@ def _means(table: list[dict[str, Any]], priors: tuple[str, ...]) -> list[dict[st
                     mean[key] = sum(row[key] for row in rows) / len(rows)
             means.append(mean)
     return means
-
-
-def _finished(path: Path) -> list[dict[str, Any]]:
-    if not path.is_file():
-        return []
-    cells = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            cells.append(json.loads(line))
-        except ValueError:  # a line cut off when the run was stopped
-            continue
-    return cells
 
 
 def _array(rows: list[list[float]]) -> Any:

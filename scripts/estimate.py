@@ -46,7 +46,7 @@ def estimate_episode(config: Estimate) -> None:
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
     from tpcd.belief.state import STATE_FILE, load_state
-    from tpcd.commands.estimation import run_estimation, summarise
+    from tpcd.commands.estimation import parameter_rows, run_estimation
     from tpcd.commands.plausibility import check_start_pose
     from tpcd.data import check_episode, read_episode
     from tpcd.results import continue_run, format_table, run_folder, write_results
@@ -81,17 +81,7 @@ def estimate_episode(config: Estimate) -> None:
             )
             steps = estimate(episode, shape, generator, settings, state)
         belief = run_estimation(steps, episode, config.prior, folder, done=done)
-        table = [
-            {
-                "parameter": name,
-                "mean": entry["mean"],
-                "low 5 %": entry["interval_90"][0],
-                "high 95 %": entry["interval_90"][1],
-                "unit": entry["unit"],
-                "learnt": "still the prior" if entry["still_the_prior"] else "yes",
-            }
-            for name, entry in summarise(belief)["parameters"].items()
-        ]
+        table = parameter_rows(belief)
         text = format_table(table)
         print(text)
         with SummaryWriter(folder / "tensorboard") as writer:

@@ -9,14 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from tpcd.cli import check_numbers, run
-
-if TYPE_CHECKING:
-    import torch
-
-    from tpcd.shape.outline import Outline
 
 SCENE_STREAM, EPISODE_STREAM = 0, 1
 """Independent random streams, so that the scene depends on the seed alone."""
@@ -119,7 +114,9 @@ def simulate(config: Simulation) -> None:
 
     from tpcd.data.episode import write_together
     from tpcd.parameters import SCENE_NAMES
+    from tpcd.random import stream
     from tpcd.results import check_target, to_plain
+    from tpcd.shape.named import find_outline
     from tpcd.truth.recording import make_motion, record, recording_contents
     from tpcd.truth.scene import draw_scene, make_truth
     from tpcd.versions import versions
@@ -134,7 +131,7 @@ def simulate(config: Simulation) -> None:
     scene = draw_scene(
         outline.name,
         outline.vertices,
-        _generator(config.seed, SCENE_STREAM),
+        stream(config.seed, SCENE_STREAM),
         fixed={name: value for name, value in given.items() if value is not None},
         stiffness=config.stiffness,
         start_pose=config.start or None,
@@ -151,7 +148,7 @@ def simulate(config: Simulation) -> None:
     made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
     contents, lines = {}, []
     for episode, stem in enumerate(config.out / name for name in names):
-        generator = _generator(
+        generator = stream(
             config.seed, EPISODE_STREAM, episode, *np.frombuffer(config.policy.encode(), np.uint8)
         )
         motion = make_motion(config.policy, scene, config.steps, generator)
@@ -166,43 +163,6 @@ def simulate(config: Simulation) -> None:
         )
     write_together(contents, config.overwrite)
     print("\n".join(lines))
-
-
-def find_outline(name: str, unit: str | None = None) -> Outline:
-    """The outline of a file (in `unit`) or of a name; `ValueError` if there is none."""
-    import difflib
-
-    from tpcd.shape.builtin import builtin_outlines
-    from tpcd.shape.sources import load_outlines
-    from tpcd.shape.ycb import load_ycb, ycb_folder
-
-    if Path(name).suffix:
-        outlines = load_outlines(name, unit=unit)
-        if len(outlines) != 1:
-            raise ValueError(
-                f"{name} holds {len(outlines)} outlines ({', '.join(list(outlines)[:6])}, …),"
-                " expected one; save the one you mean to its own file"
-            )
-        return next(iter(outlines.values()))
-    outlines = builtin_outlines()
-    if name not in outlines and ycb_folder() is not None:
-        outlines = {**outlines, **load_ycb("all")}
-    if name not in outlines:
-        close = difflib.get_close_matches(name, outlines, 4, 0.4)
-        raise ValueError(
-            f"no outline {name!r}; did you mean {', '.join(close or sorted(outlines)[:6])}?"
-            " Give a built-in name, a YCB name, or a file"
-        )
-    return outlines[name]
-
-
-def _generator(*entropy: int) -> torch.Generator:
-    """A torch generator for a stream that is named by whole numbers."""
-    import numpy as np
-    import torch
-
-    state = np.random.SeedSequence([int(number) for number in entropy]).generate_state(1, np.uint64)
-    return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
 
 if __name__ == "__main__":

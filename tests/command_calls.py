@@ -34,6 +34,7 @@ def call(script: str, *arguments: str) -> int:
     entry = {
         "simulate": ("simulate", "Simulation", ()),
         "estimate": ("estimate_episode", "Estimate", ("episode",)),
+        "explore": ("explore_object", "Exploration", ()),
         "fetch_ycb": ("fetch", "Fetching", ("folder",)),
         "predict": ("predict_episodes", "Predict", ("run", "episodes")),
     }[script]

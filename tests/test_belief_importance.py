@@ -10,7 +10,7 @@ from linear_model import DIMENSION, LinearModel
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
-from tpcd.belief.importance import assimilate, cut_off, draw_pool
+from tpcd.belief.importance import assimilate, cut_off, draw_pool, truncate
 
 SETTINGS = SamplerSettings(particles=2000, draws=6000)
 FEW = SamplerSettings(particles=500, places=20, fresh_modes=20, modes=5)
@@ -169,20 +169,17 @@ def test_dampings_share_out_the_draws_by_what_they_were_worth() -> None:
         assert int(pool.shares.argmax()) <= 1
 
 
-def test_no_draw_carries_more_than_its_share_of_the_weight() -> None:
-    """A spike that the mixture cannot know of, hit by few draws."""
-    model = LinearModel(2)
-    whole, (mean, covariance, _) = model.target(2).likelihood, model.posterior(2)
-
-    def spiked(x: Tensor) -> Tensor:
-        offset = (x[:, 0] - mean[0]).abs() / covariance[0, 0].sqrt()
-        return whole(x) + torch.where(offset < 0.006, 12.0, 0.0)
-
-    settings = SamplerSettings(particles=10_000, draws=2500, places=10, fresh_modes=5, modes=5)
-    generator = torch.Generator().manual_seed(0)
-    cloud, info = assimilate(start(), model.target(2, spiked), 1, settings, generator)
-    assert info.effective_sample_size < 40
-    assert float(cloud.weights.max()) < 1.1 / math.sqrt(2500)
+def test_few_heavy_draws_are_made_equal_but_a_single_one_is_kept() -> None:
+    weights = torch.full((10_000,), 0.5 / 9997, dtype=torch.float64)
+    weights[:3] = torch.tensor([0.3, 0.15, 0.05], dtype=torch.float64)
+    found = truncate(weights)
+    assert float(found.sum()) == pytest.approx(1.0)
+    # The mean weight is 1e-4, a hundred times as much the most that counts.
+    expected = torch.full((3,), 0.01 / 0.53, dtype=torch.float64)
+    torch.testing.assert_close(found[:3], expected)
+    alone = torch.full((10_000,), 1e-12, dtype=torch.float64)
+    alone[7] = 1.0
+    assert float(truncate(alone)[7]) > 0.999
 
 
 def test_weights_that_are_cut_off_sum_to_one_and_none_dominates() -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from eval.calibration import Calibration, calibrate, coverage_table, draw_episode, read_lines
+from eval.calibration import Calibration, calibrate, coverage_table, draw_episode
+from eval.lines import append_lines, read_lines, write_line
 from tpcd.belief.belief import EstimatorSettings, misfit_field
 from tpcd.belief.history import history_of
 from tpcd.belief.likelihood import history_likelihood
@@ -31,9 +32,13 @@ def test_uniform_places_pass_and_narrow_posteriors_fail() -> None:
 
 def test_a_cut_off_last_line_is_dropped(tmp_path: Path) -> None:
     path = tmp_path / "runs.jsonl"
+    assert read_lines(path) == []
     path.write_text('{"seed": 3, "place": [0.5]}\n{"seed": 4, "pl')
-    assert list(read_lines(path)) == [3]
-    assert path.read_text() == '{"seed": 3, "place": [0.5]}\n'
+    assert [line["seed"] for line in read_lines(path)] == [3]
+    with append_lines(path) as file:
+        write_line(file, {"seed": 4})
+        write_line(file, {"seed": 5})
+    assert [line["seed"] for line in read_lines(path)] == [3, 4, 5]
 
 
 def test_drawn_data_are_likelier_under_the_truth_than_under_another_floor() -> None:

@@ -141,10 +141,10 @@ class ContactPredictor:
         if len(belief.weights) > particles:
             generator = torch.Generator().manual_seed(0)
             keep = systematic_resample(belief.weights, particles, generator)
-            self._weights = torch.full((particles,), 1.0 / particles, dtype=torch.float64)
+            self.weights = torch.full((particles,), 1.0 / particles, dtype=torch.float64)
         else:
             keep = torch.arange(len(belief.weights))
-            self._weights = belief.weights
+            self.weights = belief.weights
         parameters = Parameters.from_vector(belief.vectors[keep])
         with torch.no_grad():
             scene = scene_from_parameters(belief.prior.shape, parameters)
@@ -195,7 +195,7 @@ class ContactPredictor:
             covariance = covariance + scaled @ scaled.mT
         usable = transition.status <= int(StepStatus.RELAXED)
         usable = usable & torch.isfinite(settled).all(-1)
-        weights = torch.where(usable, self._weights[:, None], 0.0)
+        weights = torch.where(usable, self.weights[:, None], 0.0)
         total = weights.sum(0)
         answered = total > 0
         share = weights / torch.where(answered, total, math.nan)
@@ -225,7 +225,7 @@ class ContactPredictor:
 
         Each trajectory keeps one theta and one draw of its misfit field throughout.
         """
-        chosen = torch.multinomial(self._weights, samples, replacement=True, generator=generator)
+        chosen = torch.multinomial(self.weights, samples, replacement=True, generator=generator)
         scene = self._scene.gather(chosen)
         field = self._field_mean[chosen]
         if field.shape[-1]:

@@ -92,3 +92,27 @@ def part_seconds(table: Rows) -> Figure:
     panel.set_xlabel("wall time [s]")
     title(panel, f"{table[0]['particles']:,} particles, {table[0]['transitions']:,} transitions")
     return figure
+
+
+def growth(table: Rows, axis: str, targets: Mapping[int, float]) -> Figure:
+    """Wall seconds of choosing a command over the number of particles or commands.
+
+    `table` has the columns `axis` and `wall_s`; `targets` are seconds by the value of `axis`.
+    """
+    rows = sorted(table, key=lambda row: row[axis])
+    figure, (panel,) = panels(1, 1, 5.2, 3.8)
+    entries: dict[str, LegendKey] = {}
+    values = [row[axis] for row in rows]
+    (entries["Algorithm 2"],) = panel.plot(
+        values, [row["wall_s"] for row in rows], color=SERIES[0], marker="o"
+    )
+    if targets:
+        (entries["target"],) = panel.plot(
+            list(targets), list(targets.values()), "v", color=TRUTH, linestyle="none"
+        )
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_xlabel(f"{axis} [–]")
+    panel.set_ylabel("wall time of a choice [s]")
+    legend_below(figure, entries)
+    return figure

@@ -29,6 +29,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.state import EstimatorState
 from tpcd.belief.target import ContactTarget
+from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
@@ -136,6 +137,42 @@ def estimate(
         seconds = time.perf_counter() - started
         after = EstimatorState(k, cloud_to_tensors(cloud), generator.get_state())
         yield EstimationStep(k, belief, info, seconds, after)
+
+
+def prior_belief(
+    episode: Episode,
+    shape: Shape,
+    generator: torch.Generator,
+    settings: EstimatorSettings | None = None,
+) -> Belief:
+    """The belief before any transition: draws from the prior that leave the start pose free.
+
+    Where none does, all of them.
+    """
+    settings = settings or EstimatorSettings()
+    prior = make_prior(shape, episode.priors)
+    misfit = misfit_field(shape, settings)
+    target = ContactTarget(prior, misfit, settings.step)
+    score = target.sample(settings.sampler.particles, generator)
+    vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
+    scene = scene_from_parameters(shape, Parameters.from_vector(vectors)).double()
+    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, episode.poses[0].expand(len(sd), 3))
+    free = (gaps.amin((-1, -2)) > -2 * sd).double()
+    weights = free if bool(free.any()) else torch.ones_like(free)
+    size = misfit.bumps * len(scene.terrains)
+    return Belief(
+        prior=prior,
+        vectors=vectors,
+        weights=weights / weights.sum(),
+        misfit=misfit,
+        misfit_sd=sd,
+        misfit_mean=torch.zeros(len(sd), size, dtype=torch.float64),
+        misfit_covariance=torch.diag_embed((sd**2)[:, None].expand(-1, size)),
+        step=settings.step,
+        stiffness=episode.stiffness.double(),
+        log_evidence=0.0,
+        log_evidence_std=0.0,
+    )
 
 
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:

@@ -81,9 +81,7 @@ def assimilate(
     Raises ValueError where no particle can explain the datum at all.
     """
     pool = draw_pool(cloud, target, datum, settings, generator)
-    # One draw in a place that the mixture hardly reaches would carry all the weight. A largest
-    # weight of 1 / sqrt(n) costs a bias that vanishes with n (Ionides 2008).
-    weights = cut_off(_weights(pool.log_weights), math.sqrt(len(pool.log_weights)))
+    weights = truncate(_weights(pool.log_weights))
     index, counts = systematic_resample(weights, settings.particles, generator).unique(
         return_counts=True
     )
@@ -139,8 +137,21 @@ def draw_pool(
         counts = _counts(shares, settings.draws_per_place)
         mixture = curved_mixture(centres, *target.curvature(centres), counts)
         evaluations += CURVATURE_COST * len(centres)
-    positions, log_likelihood, log_weights = trial.draw(target, settings.draws, generator)
-    evaluations += len(trial.positions) + len(positions)
+    evaluations += len(trial.positions)
+    mixture = trial.mixture
+    assert mixture is not None
+    for left in reversed(range(settings.attempts)):
+        drawn = trial.draw(target, mixture, settings.draws, generator)
+        positions, log_likelihood, log_weights = drawn
+        evaluations += len(positions)
+        if left == 0 or effective_sample_size(_weights(log_weights)) >= settings.wanted:
+            break
+        # What the draws found shapes the mixture, from which all is drawn anew.
+        centres = positions[_spread_choice(log_weights, settings.places, generator)]
+        counts = _counts(shares, settings.draws_per_place)
+        fresh = curved_mixture(centres, *target.curvature(centres), counts)
+        mixture = CurvedMixture.joined([mixture, fresh])
+        evaluations += CURVATURE_COST * len(centres)
     return Pool(positions, log_likelihood, log_weights, peaks.points, shares, evaluations)
 
 
@@ -159,6 +170,13 @@ def _weights(log_weights: Tensor) -> Tensor:
             "check units and frames of the data against the priors"
         )
     return normalise_log_weights(log_weights)
+
+
+def truncate(weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Weights of which none counts more than sqrt(n) times the mean one: a bias that vanishes
+    with n, against draws in places that the mixture hardly reaches (Ionides 2008)."""
+    kept = weights.clamp_max(weights.mean() * math.sqrt(len(weights)))
+    return kept / kept.sum()
 
 
 def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
@@ -219,22 +237,21 @@ class _Draws:
         return draws, by_damping
 
     def draw(
-        self, target: Target, count: int, generator: torch.Generator
+        self, target: Target, mixture: CurvedMixture, count: int, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """So many draws from prior and components together: positions, log likelihoods and log
         weights."""
-        assert self.mixture is not None
-        total = len(self.positions)
+        total = float(mixture.counts.sum()) + self.from_prior
         from_prior = round(count * self.from_prior / total)
         positions = torch.cat(
             (
                 target.sample(from_prior, generator),
-                self.mixture.draw_some(count - from_prior, generator),
+                mixture.draw_some(count - from_prior, generator),
             )
         )
         log_prior = target.log_prior(positions)
         density = torch.logaddexp(
-            self.mixture.log_sum(positions), log_prior + math.log(self.from_prior)
+            mixture.log_sum(positions), log_prior + math.log(self.from_prior)
         ) - math.log(total)
         least = self.log_weights.max() - _HOPELESS + density - log_prior
         least = torch.where(torch.isfinite(log_prior), least, torch.inf)

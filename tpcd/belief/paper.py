@@ -139,6 +139,20 @@ def estimate_paper(
         yield EstimationStep(k, belief, info, seconds, after)
 
 
+def paper_prior_belief(
+    episode: Episode,
+    shape: Shape,
+    generator: torch.Generator,
+    settings: PaperSettings | None = None,
+) -> Belief:
+    """The filter's belief before any transition."""
+    settings = settings or PaperSettings()
+    prior = make_prior(shape, episode.priors)
+    vectors = _draw_prior(prior, settings.particles, generator)
+    even = torch.full((settings.particles,), 1.0 / settings.particles, dtype=torch.float64)
+    return _belief(prior, vectors, even, episode, settings)
+
+
 def window_log_likelihood(
     prior: ParameterPrior,
     vectors: Float[Tensor, "m d"],

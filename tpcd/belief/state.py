@@ -54,10 +54,11 @@ def save_state(state: EstimatorState, folder: Path, episode: Episode) -> None:
     os.replace(staged, target)
 
 
-def load_state(folder: Path, episode: Episode) -> EstimatorState | None:
+def load_state(folder: Path, episode: Episode, growing: bool = False) -> EstimatorState | None:
     """Read the state back; None where no step was finished.
 
-    Raises `RunError` where it belongs to other data or cannot be read.
+    With `growing`, the episode may have got further rows since. Raises `RunError`
+    where it belongs to other data or cannot be read.
     """
     path = folder / STATE_FILE
     if not path.is_file():
@@ -73,7 +74,8 @@ def load_state(folder: Path, episode: Episode) -> EstimatorState | None:
         raise RunError(path, f"cannot be read ({error})", "estimate again") from error
     if card.get("version") != STATE_VERSION:
         raise RunError(path, "was left by another version of tpcd", "estimate again")
-    if of != fingerprint(episode):
+    known = episode.first(index + 1) if growing else episode
+    if of != fingerprint(known):
         raise RunError(path, "belongs to an episode with other numbers", "estimate again")
     return EstimatorState(index, tensors, generator)
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,40 +62,80 @@ def run_estimation(
 
     `done` steps of an earlier run in the folder are kept, and `steps` come after them.
     """
-    from torch.utils.tensorboard import SummaryWriter
-
-    figures = folder / "figures"
-    history = _earlier_rows(folder / STEPS_FILE, done)
-    belief = load_belief(folder) if done else None
-    with (
-        SummaryWriter(folder / "tensorboard", purge_step=done + 1) as writer,
-        (folder / STEPS_FILE).open("a", encoding="utf-8") as lines,
-        tqdm(total=len(episode) - 1, initial=done, unit="step", disable=not show_progress) as bar,
-    ):
-        bar.set_postfix_str("the first step also compiles, once on a machine")
+    total = len(episode) - 1
+    with EstimationRun(folder, prior_name, total, done, show_progress) as run:
         for step in steps:
-            learnt = _learnt_most(belief, step.belief)
-            belief = step.belief
-            row = _step_row(step, learnt)
-            history.append(row)
-            lines.write(json.dumps(row) + "\n")
-            lines.flush()
-            save_belief(belief, folder, prior_name)
-            save_state(step.state, folder, episode)
-            _log_scalars(writer, row, step)
-            bar.set_postfix_str(
-                f"n_eff {row['effective_sample_size']:.0f}, learnt {learnt}, "
-                f"{row['seconds']:.2f} s/step"
-            )
-            bar.update()
-        if belief is None:
+            run.add(step, episode)
+        return run.finish(episode, truth)
+
+
+class EstimationRun:
+    """A run folder that is written step by step, while a progress bar tells how it goes."""
+
+    def __init__(
+        self, folder: Path, prior_name: str, total: int, done: int = 0, show_progress: bool = True
+    ) -> None:
+        """`done` steps of an earlier run in the folder are kept."""
+        self.folder = folder
+        self.history = _earlier_rows(folder / STEPS_FILE, done)
+        self.belief = load_belief(folder) if done else None
+        self._prior_name, self._done = prior_name, done
+        self._total, self._show = total, show_progress
+
+    def __enter__(self) -> EstimationRun:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._open = ExitStack()
+        logs = SummaryWriter(self.folder / "tensorboard", purge_step=self._done + 1)
+        self.writer = self._open.enter_context(logs)
+        lines = (self.folder / STEPS_FILE).open("a", encoding="utf-8")
+        self._lines = self._open.enter_context(lines)
+        bar = tqdm(total=self._total, initial=self._done, unit="step", disable=not self._show)
+        self.bar = self._open.enter_context(bar)
+        self.bar.set_postfix_str("the first step also compiles, once on a machine")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+    def add(
+        self,
+        step: EstimationStep,
+        episode: Episode,
+        further: Mapping[str, Any] | None = None,
+        lead: str = "",
+    ) -> None:
+        """Save a step. `further` goes into its line of `steps.jsonl` and, where it is a number, to
+        TensorBoard; `lead` is shown first in the progress bar."""
+        learnt = _learnt_most(self.belief, step.belief)
+        self.belief = step.belief
+        row = {**step_row(step, learnt), **(further or {})}
+        self.history.append(row)
+        self._lines.write(json.dumps(row) + "\n")
+        self._lines.flush()
+        save_belief(step.belief, self.folder, self._prior_name)
+        save_state(step.state, self.folder, episode)
+        _log_scalars(self.writer, row, step)
+        for name, value in (further or {}).items():
+            if isinstance(value, float):
+                self.writer.add_scalar(f"exploration/{name}", value, step.index)
+        self.bar.set_postfix_str(
+            f"{lead}n_eff {row['effective_sample_size']:.0f}, learnt {learnt}, "
+            f"{row['seconds']:.2f} s/step"
+        )
+        self.bar.update()
+
+    def finish(self, episode: Episode, truth: KnownTruth | None = None) -> Belief:
+        """Write the summary and the figures; returns the belief."""
+        if self.belief is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
-        write_json(folder / "summary.json", summarise(belief))
-        warning = few_draws_warning(history[-1])
+        write_json(self.folder / "summary.json", summarise(self.belief))
+        warning = few_draws_warning(self.history[-1])
         if warning is not None:
-            bar.write(warning, file=sys.stderr)
-        _draw(belief, history, episode, figures, writer, truth)
-    return belief
+            self.bar.write(warning, file=sys.stderr)
+        figures = self.folder / "figures"
+        draw_estimation(self.belief, self.history, episode, figures, self.writer, truth)
+        return self.belief
 
 
 def few_draws_warning(row: dict[str, Any]) -> str | None:
@@ -150,6 +191,21 @@ def summarise(belief: Belief) -> dict[str, Any]:
     }
 
 
+def parameter_rows(belief: Belief) -> list[dict[str, Any]]:
+    """The table of theta that a command prints, one row for each parameter."""
+    return [
+        {
+            "parameter": name,
+            "mean": entry["mean"],
+            "low 5 %": entry["interval_90"][0],
+            "high 95 %": entry["interval_90"][1],
+            "unit": entry["unit"],
+            "learnt": "still the prior" if entry["still_the_prior"] else "yes",
+        }
+        for name, entry in summarise(belief)["parameters"].items()
+    ]
+
+
 def prior_summary(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
     """Mean and ends of the 90 % interval of every entry of theta before any datum."""
     prior = belief.prior
@@ -170,7 +226,8 @@ def _learnt_most(before: Belief | None, now: Belief) -> str:
     return names[int((std / reference.clamp_min(1e-12)).argmin())]
 
 
-def _step_row(step: EstimationStep, learnt: str) -> dict[str, Any]:
+def step_row(step: EstimationStep, learnt: str | None = None) -> dict[str, Any]:
+    """What `steps.jsonl` holds of a step."""
     belief = step.belief
     return {
         "step": step.index,
@@ -198,14 +255,16 @@ def _log_scalars(writer: Any, row: dict[str, Any], step: EstimationStep) -> None
         writer.add_scalar(f"std/{name}", float(std), step.index)
 
 
-def _draw(
+def draw_estimation(
     belief: Belief,
     history: list[dict[str, Any]],
     episode: Episode,
     folder: Path,
     writer: Any,
     truth: KnownTruth | None,
+    prefix: str = "",
 ) -> None:
+    """Figures of what was learnt: parameters step by step, the outline, and the scene."""
     z = belief.prior.shape.latent_dim
     names, units = belief.prior.names[z:], belief.prior.units[z:]
     columns = {
@@ -217,7 +276,7 @@ def _draw(
     figure = estimation_progress(
         torch.arange(last + 1).numpy(), **columns, names=names, units=units, truth=known
     )
-    save_figure(figure, folder, "estimation", writer, last)
+    save_figure(figure, folder, f"{prefix}estimation", writer, last)
     chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()
     parameters = belief.parameters
     with torch.no_grad():
@@ -225,7 +284,7 @@ def _draw(
     points = place_points(outline, parameters.scale[chosen], parameters.mount[chosen])
     vertices = None if truth is None else truth.vertices_ee.numpy()
     figure = outline_belief(points.double().numpy(), belief.weights[chosen].numpy(), vertices)
-    save_figure(figure, folder, "outline", writer, last)
+    save_figure(figure, folder, f"{prefix}outline", writer, last)
     surfaces = {}
     for name in ("floor_height", "wall_position"):
         i = names.index(name)
@@ -240,4 +299,4 @@ def _draw(
         true_wall=None if truth is None else truth.scene["wall_position"],
         commands=episode.commands.numpy(),
     )
-    save_figure(figure, folder, "scene", writer, last)
+    save_figure(figure, folder, f"{prefix}scene", writer, last)

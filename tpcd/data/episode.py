@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -77,6 +77,29 @@ class Episode:
     def __len__(self) -> int:
         """Number of rows, the start row included."""
         return self.commands.shape[0]
+
+    def first(self, rows: int) -> Episode:
+        """The first rows only."""
+        return replace(
+            self,
+            commands=self.commands[:rows],
+            poses=self.poses[:rows],
+            wrenches=self.wrenches[:rows],
+            extra={name: column[:rows] for name, column in self.extra.items()},
+        )
+
+    def with_row(
+        self, command: Float[Tensor, " 3"], pose: Float[Tensor, " 3"], wrench: Float[Tensor, " 3"]
+    ) -> Episode:
+        """The episode with one more row; raises ValueError where it has further columns."""
+        if self.extra:
+            raise ValueError(f"no values for the further columns {', '.join(self.extra)}")
+        return replace(
+            self,
+            commands=torch.cat((self.commands, command.double()[None])),
+            poses=torch.cat((self.poses, pose.double()[None])),
+            wrenches=torch.cat((self.wrenches, wrench.double()[None])),
+        )
 
 
 def read_episode(path: str | Path) -> Episode:

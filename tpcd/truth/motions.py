@@ -102,9 +102,10 @@ def rich_exploration(generator: torch.Generator) -> ScriptedMotion:
     return ScriptedMotion(lambda history: _rich_script(history, generator))
 
 
-def press_and_slide(generator: torch.Generator) -> ScriptedMotion:
+def press_and_slide(generator: torch.Generator | None) -> ScriptedMotion:
     """The paper's basic trajectory: press on the floor and move right, with zero-mean
-    perturbations of every command (arXiv 2409.17470, section V)."""
+    perturbations of every command (arXiv 2409.17470, section V); without a generator, the
+    basic trajectory itself."""
     return ScriptedMotion(lambda history: _press_and_slide_script(history, generator))
 
 
@@ -158,12 +159,42 @@ def _rich_script(history: History, generator: torch.Generator) -> Script:
         )
 
 
-def _press_and_slide_script(history: History, generator: torch.Generator) -> Script:
+def expert_motion(wall_position: float) -> ScriptedMotion:
+    """The paper's expert: one trajectory for all objects, made with the true wall [m] in view.
+
+    Down to the floor, tilt both ways under load, right to the wall in three strides, then
+    press into the corner and up along the wall at alternating tilts.
+    """
+    return ScriptedMotion(lambda history: _expert_script(history, wall_position))
+
+
+def _expert_script(history: History, wall_position: float) -> Script:
+    stiffness = history.stiffness.tolist()
+    history = yield from _descend(history)
+    x, floor_z, _ = history.poses[-1].tolist()
+    deep, light = floor_z - 4.0 / stiffness[1], floor_z - 2.0 / stiffness[1]
+    for tilt in (0.12, -0.12):
+        history = yield (x, deep, tilt)
+    stride = (wall_position - x) / 3
+    while not _wall_is_felt(history):
+        history = yield (history.poses[-1].tolist()[0] + stride, light, 0.0)
+    wall_x = history.poses[-1].tolist()[0]
+    push = 3.5 / stiffness[0]
+    corner = ((push, deep, 0.12), (push, deep, -0.12), (push, floor_z + 0.03, -0.12))
+    above = ((push, floor_z + 0.03, 0.12), (-0.03, deep, 0.0), (-0.03, deep, 0.12))
+    while True:
+        for offset, z, tilt in (*corner, *above):
+            history = yield (wall_x + offset, z, tilt)
+
+
+def _press_and_slide_script(history: History, generator: torch.Generator | None) -> Script:
     history = yield from _descend(history)
     x, floor_z, _ = history.poses[-1].tolist()
     depth = 3.0 / history.stiffness.tolist()[1]
     while True:
-        noise = torch.randn(3, generator=generator, dtype=torch.float64).tolist()
+        noise = [0.0, 0.0, 0.0]
+        if generator is not None:
+            noise = torch.randn(3, generator=generator, dtype=torch.float64).tolist()
         if not _wall_is_felt(history):
             drag = min(max(0.0, -float(history.wrenches[-1, 0])), LARGEST_DRAG)
             x = (

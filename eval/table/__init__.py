@@ -1,0 +1,1 @@
+"""The paper's experiment: objects, policies, estimators and truths in one table."""

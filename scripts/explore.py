@@ -1,0 +1,172 @@
+"""Explore an unknown object: choose each move for what it teaches, and learn from it.
+
+python scripts/explore.py --outline mug --out runs/explored
+python scripts/explore.py --outline mug --policy expert --out runs/expert
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tpcd.cli import check_numbers, run
+
+if TYPE_CHECKING:
+    from tpcd.policies.active import Task
+
+SCENE_STREAM = 0
+"""The stream of scripts/simulate.py, so that equal seeds mean equal scenes."""
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """Settings of the command; SI units."""
+
+    outline: str
+    """Outline that plays the unknown object: a built-in or YCB name, or a file."""
+    out: Path
+    """Folder for the results; a stopped run in it goes on with --resume."""
+    prior: str = "ycb-rich"
+    """Shape prior: a checkpoint folder, or the name of a shipped one."""
+    policy: Literal["active", "grid", "random", "expert", "rich"] = "active"
+    """active: the most informative command within reach; grid: of the paper's 27; random: the
+    paper's basic trajectory with noise; expert: one trajectory made with the true wall in
+    view; rich: a script that feels its way."""
+    steps: int = 15
+    """Moves at most."""
+    stop_gain: float | None = None
+    """Stop once the best command promises less than this [nat; with --task: tolerances squared]."""
+    task: Path | None = None
+    """Episode whose motions are to be predicted: learn what they depend on."""
+    stop_error: float | None = None
+    """Stop once the task's poses are expected to be predicted this well [m]."""
+    force_limit: float = 8.0
+    """Largest force on an axis [N]."""
+    force_probability: float = 0.05
+    """A command that exceeds it with more than this probability is not taken."""
+    step_limit: tuple[float, float, float] = (0.08, 0.08, 0.3)
+    """Farthest a command may be from the last pose, on each axis [m, m, rad]."""
+    workspace_low: tuple[float, float, float] = (-1.0, -1.0, -0.15)
+    """Lower corner of the workspace of commands [m, m, rad]."""
+    workspace_high: tuple[float, float, float] = (1.0, 1.0, 0.15)
+    """Upper corner of the workspace [m, m, rad]."""
+    estimator: Literal["default", "paper"] = "default"
+    """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
+    truth: Literal["quasistatic", "mujoco"] = "mujoco"
+    """Who decides what happens: the project's own model, or MuJoCo independent of it."""
+    seed: int = 0
+    """Seed of scene, noise, policy and sampler."""
+    resume: bool = False
+    """Go on with a run in the folder that was stopped."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            self,
+            least={"steps": 1},
+            above={"force_limit": 0.0, "stop_gain": 0.0, "stop_error": 0.0},
+        )
+        if self.stop_error is not None and self.task is None:
+            raise ValueError("stop_error needs a task to predict; name an episode with --task")
+
+
+def explore_object(config: Exploration) -> None:
+    """Explore an object in simulation and write belief and episode to a run folder."""
+    import sys
+    from contextlib import nullcontext
+
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+
+    from tpcd.belief.state import STATE_FILE, load_state
+    from tpcd.belief.storage import load_belief
+    from tpcd.commands.estimation import KnownTruth, parameter_rows
+    from tpcd.commands.exploring import EPISODE_NAME, Stopping, run_exploration
+    from tpcd.data.episode import read_episode, write_together
+    from tpcd.exploration import Estimator, explore
+    from tpcd.policies import Limits, make_policy
+    from tpcd.random import stream
+    from tpcd.results import continue_run, format_table, run_folder, write_results
+    from tpcd.robot import SimulatedRobot
+    from tpcd.shape.checkpoint import load_prior
+    from tpcd.shape.named import find_outline
+    from tpcd.truth.recording import recording_contents
+    from tpcd.truth.scene import draw_scene, make_truth
+
+    # Small tensor operations are fastest on one thread; the compiled loops have their own.
+    torch.set_num_threads(1)
+    outline = find_outline(config.outline)
+    scene = draw_scene(outline.name, outline.vertices, stream(config.seed, SCENE_STREAM))
+    shape = load_prior(config.prior)
+    task = None if config.task is None else _task(config.task)
+    limits = Limits(
+        config.force_limit,
+        config.step_limit,
+        config.workspace_low,
+        config.workspace_high,
+        config.force_probability,
+    )
+    notes = f"explored, truth {config.truth}, policy {config.policy}, seed {config.seed}"
+    robot = SimulatedRobot(make_truth(scene, config.truth), scene, config.seed, notes=notes)
+    policy = make_policy(config.policy, limits, scene, config.seed, task)
+    if config.resume:
+        free = ("out", "resume", "overwrite", "steps", "stop_gain", "stop_error")
+        opened = nullcontext(continue_run(config.out, config, free))
+    else:
+        opened = run_folder(
+            config.out, "scripts/explore.py", config, config.overwrite, resumable=STATE_FILE
+        )
+    with opened as folder:
+        path, episode, belief, state = folder / f"{EPISODE_NAME}.csv", None, None, None
+        if config.resume and path.is_file():
+            episode = read_episode(path)
+            state = load_state(folder, episode, growing=True)
+            belief = None if state is None else load_belief(folder)
+        if episode is not None and state is not None and state.index >= config.steps:
+            raise ValueError(f"{config.out} has all of its {config.steps} moves; raise --steps")
+
+        def save(rows) -> None:
+            write_together(recording_contents(robot.recording(rows), scene, path))
+
+        steps = explore(
+            robot, policy, Estimator(shape, config.estimator), config.seed, episode, belief, state
+        )
+        belief, episode, reason = run_exploration(
+            steps,
+            Stopping(config.steps, config.stop_gain, config.stop_error),
+            config.prior,
+            folder,
+            save,
+            task,
+            KnownTruth(scene.vertices_ee, scene.theta),
+            done=0 if state is None else state.index,
+        )
+        table = parameter_rows(belief)
+        for row in table:
+            row["true"] = scene.theta.get(row["parameter"])
+        text = format_table(table)
+        print(text)
+        with SummaryWriter(folder / "tensorboard") as writer:
+            writer.add_text("table", f"```\n{text}\n```")
+        write_results(
+            folder, table, seeds=[config.seed], moves=len(episode) - 1, stopped_because=reason
+        )
+    print(f"\n{len(episode) - 1} moves: {reason}", file=sys.stderr)
+    print(
+        f"results in {config.out}; next: python scripts/predict.py {config.out} EPISODE"
+        " --out FILE.csv"
+    )
+
+
+def _task(path: Path) -> Task:
+    from tpcd.data import read_episode
+    from tpcd.policies.active import Task
+
+    episode = read_episode(path)
+    return Task(episode.poses[:-1], episode.commands[1:], episode.commands[:-1])
+
+
+if __name__ == "__main__":
+    run(explore_object, Exploration)

@@ -1,0 +1,170 @@
+"""Exploration end to end: the command, being stopped and going on, and when to stop."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from command_calls import PRIOR, call
+
+from tpcd.belief import EstimatorSettings, SamplerSettings
+from tpcd.belief.paper import PaperSettings
+from tpcd.commands.exploring import Stopping
+from tpcd.data.episode import Episode, read_episode
+from tpcd.exploration import Estimator, ExplorationStep, explore
+from tpcd.policies import ActivePolicy, ActiveSettings, Limits, Policy, make_policy
+from tpcd.robot import Robot, SimulatedRobot
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
+from tpcd.truth.recording import read_truth
+from tpcd.truth.scene import Scene, draw_scene, make_truth
+
+SMALL = ActiveSettings(first=24, rounds=1, later=12, elite=4, particles=30, finalists=3)
+FAST = SamplerSettings(particles=80, draws=500, places=20, fresh_modes=20, prior_draws=300)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    outline = builtin_outlines()["mug"]
+    return draw_scene("mug", outline.vertices, torch.Generator().manual_seed(31))
+
+
+def robot_in(scene: Scene) -> SimulatedRobot:
+    return SimulatedRobot(make_truth(scene, "quasistatic"), scene, seed=5)
+
+
+def estimator_of(kind: str) -> Estimator:
+    return Estimator(
+        load_prior("ycb21-z2"),
+        kind,  # type: ignore[arg-type]
+        EstimatorSettings(sampler=FAST),
+        PaperSettings(particles=150),
+    )
+
+
+def policy_of(name: str, scene: Scene) -> Policy:
+    if name == "active":
+        return ActivePolicy(Limits(), SMALL)
+    return make_policy(name, Limits(), scene, seed=2)  # type: ignore[arg-type]
+
+
+def first_steps(count: int, steps) -> list[ExplorationStep]:
+    return [step for step, _ in zip(steps, range(count), strict=False)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("default", "active"), ("paper", "grid"), ("default", "random")]
+)
+def test_an_exploration_that_was_stopped_goes_on_the_same(
+    kind: str, name: str, scene: Scene
+) -> None:
+    estimator = estimator_of(kind)
+    whole = first_steps(3, explore(robot_in(scene), policy_of(name, scene), estimator, 4))
+    again = explore(
+        robot_in(scene), policy_of(name, scene), estimator, 4,
+        whole[0].episode, whole[0].estimation.belief, whole[0].estimation.state,
+    )  # fmt: skip
+    for expected, found in zip(whole[1:], first_steps(2, again), strict=True):
+        torch.testing.assert_close(found.episode.commands, expected.episode.commands)
+        torch.testing.assert_close(found.episode.poses, expected.episode.poses)
+        torch.testing.assert_close(
+            found.estimation.belief.vectors, expected.estimation.belief.vectors
+        )
+
+
+def test_rows_that_were_not_learnt_from_come_first(scene: Scene) -> None:
+    estimator, policy = estimator_of("default"), policy_of("random", scene)
+    whole = first_steps(3, explore(robot_in(scene), policy, estimator, 4))
+    again = explore(
+        robot_in(scene), policy_of("random", scene), estimator, 4,
+        whole[1].episode, whole[0].estimation.belief, whole[0].estimation.state,
+    )  # fmt: skip
+    for expected, found in zip(whole[1:], first_steps(2, again), strict=True):
+        torch.testing.assert_close(
+            found.estimation.belief.vectors, expected.estimation.belief.vectors
+        )
+    torch.testing.assert_close(found.episode.commands, whole[2].episode.commands)
+
+
+def test_a_simulated_robot_reads_the_truth_with_noise_and_refuses_other_rows(scene: Scene) -> None:
+    robot = robot_in(scene)
+    assert isinstance(robot, Robot)
+    episode = robot.start()
+    torch.testing.assert_close(episode.commands[0], scene.start_pose)
+    for z in (0.01, 0.03):
+        command = scene.start_pose - torch.tensor([0.0, z, 0.0], dtype=torch.float64)
+        reading = robot.settle(command)
+        episode = episode.with_row(command, reading.pose, reading.wrench)
+    recording = robot.recording(episode)
+    offset = torch.cat((episode.poses, episode.wrenches), -1) - torch.cat(
+        (recording.true.poses, recording.true.wrenches), -1
+    )
+    score = offset / episode.sensor_std
+    assert score.abs().max() < 4 and score.square().mean() > 0.3
+    robot_in(scene).resume(episode)
+    moved = replace(episode, poses=episode.poses + 1e-3)
+    with pytest.raises(ValueError, match="another scene"):
+        robot_in(scene).resume(moved)
+
+
+def test_stopping_says_why(scene: Scene) -> None:
+    step = first_steps(1, explore(robot_in(scene), policy_of("active", scene),
+                                  estimator_of("default"), 4))[0]  # fmt: skip
+    assert Stopping(steps=5).reason(step, None) is None
+    assert Stopping(steps=1).reason(step, None) == "all 1 moves are made"
+    assert step.choice.gain is not None
+    low = Stopping(steps=5, gain=0.5 * step.choice.gain)
+    assert low.reason(step, None) is None
+    assert "promised only" in (replace(low, gain=2 * step.choice.gain).reason(step, None) or "")
+
+
+ARGUMENTS = ("--outline", "soup_can", "--prior", PRIOR, "--truth", "quasistatic")
+
+
+def test_the_command_explores_stops_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert call("explore", *ARGUMENTS, "--steps", "2", "--out", str(out)) == 0
+    assert "all 2 moves are made" in capsys.readouterr().err
+    rows = [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+    assert len(rows) == 2 and rows[0]["gain"] > 0
+    episode = read_episode(out / "explore.csv")
+    assert len(episode) == 3
+    true, _ = read_truth(out / "explore.csv")
+    assert (true.poses - episode.poses).abs().max() < 4e-3
+    for name in ("estimation", "outline", "scene"):
+        assert (out / "figures" / f"{name}.png").is_file()
+    assert json.loads((out / "results.json").read_text())["moves"] == 2
+    # Asked for more, it goes on from there.
+    capsys.readouterr()
+    assert call("explore", *ARGUMENTS, "--steps", "2", "--out", str(out), "--resume") == 2
+    assert "raise --steps" in capsys.readouterr().err
+    assert call("explore", *ARGUMENTS, "--steps", "3", "--out", str(out), "--resume") == 0
+    longer: Episode = read_episode(out / "explore.csv")
+    torch.testing.assert_close(longer.poses[:3], episode.poses)
+    assert len((out / "steps.jsonl").read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--stop_error", "1e-3"), "needs a task"),
+        (("--force_limit", "0"), "force_limit"),
+        (("--step_limit", "0", "0", "0"), "step"),
+        (("--workspace_low", "1", "1", "1"), "workspace"),
+        (("--policy", "brave"), "policy"),
+        (("--task", "nowhere.csv"), "nowhere.csv"),
+    ],
+)
+def test_bad_input_gets_one_line_and_leaves_nothing(
+    wrong: tuple[str, ...], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert call("explore", *ARGUMENTS, "--out", str(out), *wrong) == 2
+    message = capsys.readouterr().err.strip()
+    assert said in message and message.count("\n") == 0
+    assert not out.exists()

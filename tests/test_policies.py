@@ -1,0 +1,208 @@
+"""Policies: limits are kept, scripts can be taken up again, the search finds what teaches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tpcd.belief import EstimatorSettings, SamplerSettings
+from tpcd.belief.belief import Belief, prior_belief
+from tpcd.data.episode import Episode
+from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
+from tpcd.policies import (
+    ActivePolicy,
+    ActiveSettings,
+    GridPolicy,
+    Limits,
+    MotionPolicy,
+    Situation,
+    make_policy,
+)
+from tpcd.policies.active import Task
+from tpcd.policies.basic import best_within
+from tpcd.predict import ContactPredictor
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
+from tpcd.truth.motions import press_and_slide, rich_exploration
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import Scene, draw_scene, make_truth
+
+SMALL = ActiveSettings(first=32, rounds=2, later=16, elite=4, particles=40, finalists=4)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    generator = torch.Generator().manual_seed(21)
+    return draw_scene("soup_can", builtin_outlines()["soup_can"].vertices, generator)
+
+
+@pytest.fixture(scope="module")
+def episode(scene: Scene) -> Episode:
+    generator = torch.Generator().manual_seed(22)
+    motion = make_motion("press_and_slide", scene, 5, generator)
+    return record(make_truth(scene, "quasistatic"), scene, motion, 5, generator).measured
+
+
+@pytest.fixture(scope="module")
+def belief(episode: Episode) -> Belief:
+    settings = EstimatorSettings(sampler=SamplerSettings(particles=200))
+    generator = torch.Generator().manual_seed(0)
+    return prior_belief(episode, load_prior("ycb21-z2"), generator, settings)
+
+
+def known_but(belief: Belief, name: str) -> Belief:
+    """The belief with everything but one parameter known."""
+    middle = belief.vectors[:1].clone()
+    for i, entry in enumerate(SCENE_NAMES, start=belief.prior.shape.latent_dim):
+        low, high = DEFAULT_BOUNDS[entry]
+        middle[:, i] = 0.5 * (low + high)
+    vectors = middle.repeat(len(belief.vectors), 1)
+    column = belief.prior.names.index(name)
+    vectors[:, column] = belief.vectors[:, column]
+    return replace(
+        belief, vectors=vectors, misfit_sd=torch.full_like(belief.misfit_sd, 1e-4),
+        misfit_covariance=1e-4 * belief.misfit_covariance,
+    )  # fmt: skip
+
+
+def row_at(episode: Episode, pose: tuple[float, float, float]) -> Episode:
+    """An episode of one row, at rest in a pose."""
+    here = torch.tensor([pose], dtype=torch.float64)
+    return replace(episode, commands=here, poses=here, wrenches=torch.zeros_like(here))
+
+
+def test_the_box_is_step_workspace_and_blocked_arm_together() -> None:
+    limits = Limits(force=4.0, step=(0.03, 0.1, 0.2), low=(-1.0, -1.0, -0.1), high=(0.02, 1.0, 0.1))
+    stiffness = torch.tensor([100.0, 200.0, 50.0], dtype=torch.float64)
+    low, high = limits.box(torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64), stiffness)
+    assert low.tolist() == pytest.approx([-0.03, 0.48, -0.1])
+    assert high.tolist() == pytest.approx([0.02, 0.52, 0.1])
+    # From outside, the way leads back in.
+    low, high = limits.box(torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64), stiffness)
+    assert low[0] == pytest.approx(-0.01) and high[0] == pytest.approx(0.02)
+    for wrong in (
+        {"force": 0.0},
+        {"probability": 1.0},
+        {"low": (1.0, 0.0, 0.0), "high": (0.0,) * 3},
+    ):
+        with pytest.raises(ValueError, match="expected|must be"):
+            Limits(**wrong)  # type: ignore[arg-type]
+
+
+def test_excess_probability_is_the_share_of_particles_whose_floor_is_too_high(
+    belief: Belief, episode: Episode
+) -> None:
+    known = known_but(belief, "floor_height")
+    start = row_at(episode, (0.0, 0.2, 0.0)).poses
+    down = torch.tensor([[0.0, -0.02, 0.0], [0.0, 0.2, 0.0]], dtype=torch.float64)
+    prediction = ContactPredictor(known).predict(start.expand(2, 3), down)
+    force = 100.0 * (prediction.component_mean - down)[:, 0, 1]
+    limit = float(force.quantile(0.6))
+    found = Limits(force=limit).excess_probability(prediction)
+    assert float(found[0]) == pytest.approx(float((force > limit).double().mean()), abs=0.03)
+    assert float(found[1]) == 0.0
+
+
+def test_the_best_allowed_command_is_taken_and_else_the_gentlest() -> None:
+    gain = torch.tensor([1.0, 3.0, 2.0], dtype=torch.float64)
+    assert best_within(gain, torch.tensor([0.0, 0.5, 0.01]), 0.05) == 2
+    assert best_within(gain, torch.tensor([0.7, 0.5, 0.4]), 0.05) == 2
+
+
+@pytest.mark.parametrize("name", ["active", "grid"])
+def test_commands_keep_their_limits(
+    name: str, belief: Belief, episode: Episode, scene: Scene
+) -> None:
+    limits = Limits(force=5.0, step=(0.02, 0.03, 0.1))
+    policy = make_policy(name, limits, scene, seed=0)  # type: ignore[arg-type]
+    for rows in (1, 3, 6):
+        situation = Situation(episode.first(rows), belief)
+        choice = policy.choose(situation, torch.Generator().manual_seed(1))
+        low, high = limits.box(episode.poses[rows - 1], episode.stiffness)
+        assert (choice.command >= low - 1e-12).all() and (choice.command <= high + 1e-12).all()
+        assert choice.gain is not None and choice.gain >= 0
+        assert choice.excess_probability is not None
+
+
+def test_a_lower_force_limit_holds_the_hand_back(belief: Belief, episode: Episode) -> None:
+    """The floor is uncertain by 40 mm: pressing deep is informative and forbidden."""
+    known = known_but(belief, "floor_height")
+    start = row_at(episode, (0.0, 0.13, 0.0))
+    for force in (8.0, 1.0):
+        limits = Limits(force=8.0, step=(0.08, 0.08, 0.01))
+        limits = replace(limits, force=force) if force == 8.0 else Limits(
+            force=force, step=(0.08, 0.08, 0.01)
+        )  # fmt: skip
+        choice = ActivePolicy(limits, SMALL).choose(
+            Situation(start, known), torch.Generator().manual_seed(0)
+        )
+        assert choice.excess_probability is not None
+        assert choice.excess_probability <= limits.probability
+
+
+def test_the_search_goes_down_for_the_floor_and_right_for_the_wall(
+    belief: Belief, episode: Episode
+) -> None:
+    limits = Limits(step=(0.03, 0.03, 0.01))
+    generator = torch.Generator().manual_seed(0)
+    start = row_at(episode, (0.0, 0.12, 0.0))
+    down = ActivePolicy(limits, SMALL).choose(
+        Situation(start, known_but(belief, "floor_height")), generator
+    )
+    assert down.command[1] < start.poses[0, 1]
+    # The wall is two or three steps away: the first one leads towards it.
+    right = ActivePolicy(limits, SMALL).choose(
+        Situation(row_at(episode, (0.03, 0.3, 0.0)), known_but(belief, "wall_position")), generator
+    )
+    assert right.command[0] > 0.03 + 0.02
+    assert right.gain is not None and right.gain > 0.1
+
+
+def test_a_task_makes_the_search_learn_what_the_task_needs(
+    belief: Belief, episode: Episode
+) -> None:
+    """Floor and wall are both unknown; a task on the floor asks for the floor."""
+    one, other = known_but(belief, "floor_height"), known_but(belief, "wall_position")
+    both = replace(one, vectors=one.vectors.clone())
+    column = belief.prior.names.index("wall_position")
+    order = torch.randperm(len(both.vectors), generator=torch.Generator().manual_seed(3))
+    both.vectors[:, column] = other.vectors[order, column]
+    here = torch.tensor([[0.0, 0.08, 0.0]], dtype=torch.float64)
+    pressed = here + torch.tensor([[0.0, -0.06, 0.0]], dtype=torch.float64)
+    task = Task(here, pressed)
+    situation = Situation(row_at(episode, (0.0, 0.08, 0.0)), both)
+    choice = ActivePolicy(Limits(step=(0.08, 0.08, 0.01)), SMALL, task).choose(
+        situation, torch.Generator().manual_seed(0)
+    )
+    assert choice.command[1] < 0.05
+    before = task.predicted_error(ContactPredictor(both))
+    assert before[1] > 3e-3 and before[4] == pytest.approx(100 * float(before[1]))
+    now = float((before[:3] / torch.tensor(task.tolerance)).square().mean())
+    assert choice.gain == pytest.approx(now, rel=0.3)
+
+
+def test_scripts_taken_up_again_give_the_same_commands(episode: Episode) -> None:
+    def make():
+        return rich_exploration(torch.Generator().manual_seed(5))
+
+    policy = MotionPolicy(make)
+    whole = [policy.next_command(episode.first(rows)) for rows in range(1, 7)]
+    torch.testing.assert_close(MotionPolicy(make).next_command(episode), whole[-1], rtol=0, atol=0)
+    torch.testing.assert_close(policy.next_command(episode.first(3)), whole[2], rtol=0, atol=0)
+
+
+def test_the_grid_policy_stays_near_the_basic_trajectory(belief: Belief, episode: Episode) -> None:
+    basic = MotionPolicy(lambda: press_and_slide(None))
+    wanted = MotionPolicy(lambda: press_and_slide(None)).next_command(episode)
+    wide = Limits(force=1e3, step=(1.0, 1.0, 1.0), low=(-math.inf,) * 3, high=(math.inf,) * 3)
+    choice = GridPolicy(basic, wide).choose(
+        Situation(episode, belief), torch.Generator().manual_seed(0)
+    )
+    reach = torch.tensor([0.03, 0.03, 0.025], dtype=torch.float64)
+    offset: Tensor = (choice.command - wanted).abs()
+    assert (offset <= reach + 1e-12).all()
+    assert choice.considered == 27

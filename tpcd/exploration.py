@@ -1,0 +1,102 @@
+"""Exploration: choose a command, move, measure, learn, and again.
+
+The robot may be real or simulated, the policy any, the estimator ours or the paper's. What
+was measured and learnt is handed out after every step, so that nothing is lost when it ends.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+
+from tpcd.belief.belief import Belief, EstimationStep, EstimatorSettings, estimate, prior_belief
+from tpcd.belief.paper import PaperSettings, estimate_paper, paper_prior_belief
+from tpcd.belief.state import EstimatorState
+from tpcd.data.episode import Episode
+from tpcd.policies.protocol import Choice, Policy, Situation
+from tpcd.random import stream
+from tpcd.robot.protocol import Robot
+from tpcd.shape.protocol import Shape
+
+_POLICY_STREAM, _PRIOR_STREAM = 1, 2
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """How beliefs are formed while an episode grows."""
+
+    shape: Shape
+    kind: Literal["default", "paper"] = "default"
+    settings: EstimatorSettings = field(default_factory=EstimatorSettings)
+    """Of the default estimator."""
+    paper: PaperSettings = field(default_factory=PaperSettings)
+    """Of the paper's filter."""
+
+    def before(self, episode: Episode, generator: torch.Generator) -> Belief:
+        """The belief before any transition."""
+        if self.kind == "paper":
+            return paper_prior_belief(episode, self.shape, generator, self.paper)
+        return prior_belief(episode, self.shape, generator, self.settings)
+
+    def steps(
+        self, episode: Episode, generator: torch.Generator, state: EstimatorState | None = None
+    ) -> Iterator[EstimationStep]:
+        """The beliefs after the transitions that `state` does not hold yet."""
+        if self.kind == "paper":
+            return estimate_paper(episode, self.shape, generator, self.paper, state)
+        return estimate(episode, self.shape, generator, self.settings, state)
+
+
+@dataclass(frozen=True)
+class ExplorationStep:
+    """One move: why it was chosen, what it taught, and all rows so far."""
+
+    choice: Choice
+    choosing_seconds: float
+    settled: bool
+    estimation: EstimationStep
+    episode: Episode
+
+
+def explore(
+    robot: Robot,
+    policy: Policy,
+    estimator: Estimator,
+    seed: int,
+    episode: Episode | None = None,
+    belief: Belief | None = None,
+    state: EstimatorState | None = None,
+) -> Iterator[ExplorationStep]:
+    """Explore without end; the caller stops when it has seen enough.
+
+    With `episode`, `belief` and `state` of an exploration that was stopped it goes on after
+    their rows, with the very choices it would have made; rows that were measured but not yet
+    learnt from come first. Raises ValueError where no particle can explain what was measured.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    if episode is None:
+        episode = robot.start()
+    else:
+        robot.resume(episode)
+        learnt = 0 if state is None else state.index
+        if learnt < len(episode) - 1:
+            for step in estimator.steps(episode, generator, state):
+                belief, state = step.belief, step.state
+                done = episode.first(step.index + 1)
+                yield ExplorationStep(Choice(done.commands[-1]), 0.0, True, step, done)
+    if belief is None:
+        belief = estimator.before(episode, stream(seed, _PRIOR_STREAM))
+    while True:
+        row = len(episode)
+        started = time.perf_counter()
+        choice = policy.choose(Situation(episode, belief), stream(seed, _POLICY_STREAM, row))
+        seconds = time.perf_counter() - started
+        reading = robot.settle(choice.command)
+        episode = episode.with_row(choice.command, reading.pose, reading.wrench)
+        (step,) = estimator.steps(episode, generator, state)
+        belief, state = step.belief, step.state
+        yield ExplorationStep(choice, seconds, reading.settled, step, episode)

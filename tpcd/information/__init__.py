@@ -1,0 +1,22 @@
+"""What a command is expected to teach: information gain over a belief."""
+
+from tpcd.information.gain import (
+    expected_information_gain,
+    expected_variance,
+    pair_log_likelihood,
+    reweight,
+)
+from tpcd.information.grid import GridSettings, grid_commands, grid_gain
+from tpcd.information.outcomes import Outcomes, belief_outcomes
+
+__all__ = [
+    "GridSettings",
+    "Outcomes",
+    "belief_outcomes",
+    "expected_information_gain",
+    "expected_variance",
+    "grid_commands",
+    "grid_gain",
+    "pair_log_likelihood",
+    "reweight",
+]

@@ -1,0 +1,112 @@
+"""Expected information gain of commands, from weighted particles and their outcomes.
+
+Every particle i in turn plays the truth: its outcome y, at a few points of its noise, changes
+the weights w to w' (Bayes), and the gain is the Kullback-Leibler divergence of w' from w,
+averaged over particles by weight and over the noise. The points of the noise are those of
+spherical cubature (McNamee and Stenger 1967; Arasaratnam and Haykin 2009): 2 k points at the
+distance sqrt(k), exact up to the third degree. In a linear normal model the divergence is
+quadratic in the noise, so that only the number of particles limits the answer. Nothing is
+drawn at random: permuting particles, or splitting one into two of half its weight, changes
+nothing.
+
+With m particles no gain exceeds log m. Everything is in the log domain.
+Axes: c commands, m particles, n outcomes that are looked at, k channels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.information.outcomes import Outcomes
+
+_NUMBERS_AT_ONCE = 4_000_000
+"""Pairs of outcome and particle held in memory at once."""
+
+
+def expected_information_gain(
+    outcomes: Outcomes, noise: Float[Tensor, "p k"] | None = None
+) -> Float[Tensor, " c"]:
+    """Expected information gain of each command [nat], between 0 and log m.
+
+    `noise` are the points of the noise, in standard deviations (None: the cubature's).
+    """
+    gains = []
+    for part in split_commands(outcomes):
+        log_likelihood, share = pair_log_likelihood(part, noise)
+        posterior, log_norm = reweight(log_likelihood, part.weights)
+        gains.append((share * ((posterior * log_likelihood).sum(-1) - log_norm)).sum(-1))
+    return torch.cat(gains).clamp_min(0.0)
+
+
+def expected_variance(
+    outcomes: Outcomes, values: Float[Tensor, "m v"], scale: Float[Tensor, " v"]
+) -> Float[Tensor, " c"]:
+    """Mean over v quantities of their variance expected after each command, in units of scale^2.
+
+    `values` are what each particle says about the quantities, such as the predicted poses of
+    a task. What it says now has the variance of `values` under the weights.
+    """
+    centred = (values - values.mean(0)) / scale
+    expected = []
+    for part in split_commands(outcomes):
+        log_likelihood, share = pair_log_likelihood(part)
+        posterior, _ = reweight(log_likelihood, part.weights)
+        mean = posterior @ centred
+        variance = (posterior @ centred.square() - mean.square()).clamp_min(0.0)
+        expected.append((share * variance.mean(-1)).sum(-1))
+    return torch.cat(expected)
+
+
+def pair_log_likelihood(
+    outcomes: Outcomes, noise: Float[Tensor, "p k"] | None = None
+) -> tuple[Float[Tensor, "c n m"], Float[Tensor, "c n"]]:
+    """Log likelihood of each outcome that is looked at under every particle, up to a constant
+    common to all, and the probability of the outcome."""
+    c, m, k = outcomes.mean.shape
+    centre = (outcomes.weights[..., None] * outcomes.mean).sum(1, keepdim=True)
+    mean = outcomes.mean - centre
+    points = cubature_points(k, mean.dtype).to(mean.device) if noise is None else noise
+    drawn = mean[:, :, None] + torch.einsum("cmij,pj->cmpi", outcomes.factor, points)
+    drawn = drawn.flatten(1, 2)
+    # y^T P y - 2 (P mean)^T y + mean^T P mean as one matrix product over monomials of y.
+    precision = torch.cholesky_inverse(outcomes.factor)
+    pulled = (precision @ mean[..., None])[..., 0]
+    log_det = outcomes.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    constant = -0.5 * (pulled * mean).sum(-1) - log_det
+    rows, columns = torch.triu_indices(k, k, device=mean.device)
+    double = torch.where(rows == columns, -0.5, -1.0)
+    monomials = torch.cat(
+        (drawn[..., rows] * drawn[..., columns], drawn, torch.ones_like(drawn[..., :1])), dim=-1
+    )
+    coefficients = torch.cat(
+        (precision[..., rows, columns] * double, pulled, constant[..., None]), dim=-1
+    )
+    share = outcomes.weights[..., None].expand(c, m, len(points)) / len(points)
+    return monomials @ coefficients.mT, share.flatten(1)
+
+
+def reweight(
+    log_likelihood: Float[Tensor, "c n m"], weights: Float[Tensor, "c m"]
+) -> tuple[Float[Tensor, "c n m"], Float[Tensor, "c n"]]:
+    """Weights after each outcome, and the log of what they were divided by."""
+    joint = log_likelihood + weights.log()[:, None]
+    log_norm = torch.logsumexp(joint, dim=-1)
+    return (joint - log_norm[..., None]).exp(), log_norm
+
+
+def cubature_points(k: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "p k"]:
+    """The 2 k points of spherical cubature for a standard normal of k dimensions."""
+    one = math.sqrt(k) * torch.eye(k, dtype=dtype)
+    return torch.cat((one, -one))
+
+
+def split_commands(outcomes: Outcomes) -> list[Outcomes]:
+    """The same in parts of a few commands, small enough for memory."""
+    _, m, k = outcomes.mean.shape
+    size = max(1, _NUMBERS_AT_ONCE // (2 * k * m * m))
+    parts = (value.split(size) for value in vars(outcomes).values())
+    return [Outcomes(*part) for part in zip(*parts, strict=True)]

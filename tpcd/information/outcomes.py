@@ -1,0 +1,67 @@
+"""What every particle of a belief expects a command to bring, as the sensors would tell it.
+
+The settled pose is measured twice, directly and through the wrench w = K (x' - u), which
+together are worth one reading of the pose with smaller noise. So an outcome has three
+channels (x, z, phi), and its covariance holds the outline misfit, the noise of the start pose
+and the noise of that reading.
+
+Axes: c commands, m particles, k channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.predict import ContactPredictor, Prediction
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Normal distributions of what will be read, one for each command and particle."""
+
+    mean: Float[Tensor, "c m k"]
+    factor: Float[Tensor, "c m k k"]
+    """Cholesky factors of the covariances, lower triangular."""
+    weights: Float[Tensor, "c m"]
+    """Weights of the particles for each command, which sum to 1."""
+
+
+def belief_outcomes(
+    predictor: ContactPredictor,
+    pose: Float[Tensor, " 3"],
+    commands: Float[Tensor, "c 3"],
+    previous: Float[Tensor, " 3"] | None,
+    sensor_std: Float[Tensor, " 6"],
+) -> tuple[Outcomes, Prediction]:
+    """Outcomes of c commands from one measured pose [m, m, rad], and the prediction behind them.
+
+    `previous` is the command at which the arm rests in the pose. A command that no particle
+    can answer gets outcomes that do not depend on the particle, so that it teaches nothing.
+    """
+    start = pose.expand(len(commands), 3)
+    before = None if previous is None else previous.expand(len(commands), 3)
+    prediction = predictor.predict(start, commands, before, pose_std=sensor_std[:3])
+    reading = torch.diag(reading_variance(sensor_std, prediction.stiffness))
+    covariance = prediction.component_covariance.transpose(0, 1) + reading
+    mean = prediction.component_mean.transpose(0, 1)
+    weights = prediction.weights.T
+    none = ~prediction.answered
+    if bool(none.any()):
+        mean = torch.where(none[:, None, None], 0.0, mean)
+        weights = torch.where(none[:, None], 1.0 / weights.shape[1], weights)
+    return Outcomes(mean, torch.linalg.cholesky(covariance), weights), prediction
+
+
+def reading_variance(
+    sensor_std: Float[Tensor, " 6"], stiffness: Float[Tensor, " 3"]
+) -> Float[Tensor, " 3"]:
+    """Variance of the settled pose as pose and wrench together tell it [m^2, m^2, rad^2]."""
+    variance = sensor_std.double() ** 2
+    pose, wrench = variance[:3], variance[3:] / stiffness.double() ** 2
+    total = pose + wrench
+    # Two exact sensors are one exact sensor.
+    return torch.where(total > 0, pose * wrench / total.clamp_min(1e-300), 0.0)

@@ -1,0 +1,169 @@
+"""Our own exploration: the command itself is optimised for what it is expected to teach.
+
+Which commands are compared matters far more than how their gain is estimated. So there is
+no basic trajectory and no grid: commands within reach are searched by the cross-entropy
+method (Rubinstein 1999). Some are spread evenly; then normal distributions fitted to the
+best ones are drawn from, and the best few of all are compared with more particles.
+
+What is searched are goals up to a few steps away, since a wall out of reach teaches nothing
+until one is there: a goal n steps away is worth 1 / n of the gain of going there, and the first
+step towards it is what is commanded. Commands that exceed the force limit with more than the
+set probability are never taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.information import belief_outcomes, expected_information_gain, expected_variance
+from tpcd.policies.basic import best_within
+from tpcd.policies.limits import Limits
+from tpcd.policies.protocol import Choice, Situation
+from tpcd.predict import ContactPredictor
+
+
+@dataclass(frozen=True)
+class ActiveSettings:
+    """Budget of the search."""
+
+    strides: float = 3.0
+    """Goals are searched up to so many steps away."""
+    first: int = 96
+    """Goals spread evenly over what is within reach, half of them within one step."""
+    rounds: int = 3
+    """Rounds of refinement."""
+    later: int = 32
+    """Commands of each round."""
+    elite: int = 8
+    """Best commands that a round is fitted to."""
+    particles: int = 100
+    """Particles that commands are compared with."""
+    finalists: int = 8
+    """Best commands of all that are compared once more."""
+    final_particles: int = 300
+    """Particles for that."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Motions the user wants predicted: n transitions from poses to commands [m, m, rad]."""
+
+    poses: Float[Tensor, "n 3"]
+    commands: Float[Tensor, "n 3"]
+    previous: Float[Tensor, "n 3"] | None = None
+    tolerance: tuple[float, float, float] = (1e-3, 1e-3, 5e-3)
+    """Errors of the settled pose that count alike [m, m, rad]; forces follow from them."""
+
+    def answers(self, predictor: ContactPredictor) -> Float[Tensor, "m v"]:
+        """What each particle predicts, in units of the tolerance."""
+        prediction = predictor.predict(self.poses, self.commands, self.previous)
+        scale = torch.tensor(self.tolerance, dtype=torch.float64)
+        return (prediction.component_mean / scale).flatten(1)
+
+    def predicted_error(self, predictor: ContactPredictor) -> Float[Tensor, " 6"]:
+        """Root mean square error that the belief expects of its predictions, each channel."""
+        prediction = predictor.predict(self.poses, self.commands, self.previous)
+        return prediction.std.square().mean(0).sqrt()
+
+
+class ActivePolicy:
+    """Chooses the command of the largest expected gain of information within the limits.
+
+    With a `task` it is what the task's predictions depend on that is learnt: the gain is the
+    expected fall of their mean variance, in units of the tolerance squared.
+    """
+
+    def __init__(
+        self, limits: Limits, settings: ActiveSettings | None = None, task: Task | None = None
+    ) -> None:
+        self._limits = limits
+        self._settings = settings or ActiveSettings()
+        self._task = task
+
+    def choose(self, situation: Situation, generator: torch.Generator) -> Choice:
+        """Search the commands within reach."""
+        settings, allowed = self._settings, self._limits.probability
+        predictor = ContactPredictor(situation.belief, settings.particles)
+        goals = self._spread_goals(situation, generator)
+        gain, excess = self._rate(predictor, situation, goals)
+        low, high = self._reach(situation, settings.strides)
+        for _ in range(settings.rounds):
+            elite = goals[_ranked(gain, excess, allowed)[: settings.elite]]
+            noise = torch.randn(settings.later, 3, generator=generator, dtype=torch.float64)
+            fresh = _within(elite.mean(0) + noise * elite.std(0), low, high)
+            rated = self._rate(predictor, situation, fresh)
+            goals = torch.cat((goals, fresh))
+            gain, excess = (torch.cat(pair) for pair in zip((gain, excess), rated, strict=True))
+        finalists = goals[_ranked(gain, excess, allowed)[: settings.finalists]]
+        predictor = ContactPredictor(situation.belief, settings.final_particles)
+        gain, excess = self._rate(predictor, situation, finalists)
+        best = best_within(gain, excess, allowed)
+        command = self._first_step(situation, finalists)[0][best]
+        return Choice(command, float(gain[best]), len(goals), float(excess[best]))
+
+    def _reach(self, situation: Situation, strides: float) -> tuple[Tensor, Tensor]:
+        """Lowest and highest goal so many steps away."""
+        episode = situation.episode
+        return self._limits.box(episode.poses[-1], episode.stiffness, strides)
+
+    def _spread_goals(self, situation: Situation, generator: torch.Generator) -> Tensor:
+        seed = int(torch.randint(2**31, (), generator=generator))
+        place = torch.quasirandom.SobolEngine(3, scramble=True, seed=seed)
+        half = self._settings.first // 2
+        near, far = (
+            place.draw(self._settings.first).double().split((self._settings.first - half, half))
+        )
+        parts = []
+        for share, strides in ((near, 1.0), (far, self._settings.strides)):
+            low, high = self._reach(situation, strides)
+            parts.append(low + (high - low) * share)
+        return torch.cat(parts)
+
+    def _first_step(self, situation: Situation, goals: Tensor) -> tuple[Tensor, Tensor]:
+        """The command towards each goal, and how many steps the goal is away."""
+        low, high = self._reach(situation, 1.0)
+        here = _within(situation.episode.poses[-1], low, high)
+        offset = goals - here
+        room = torch.where(offset > 0, high - here, here - low).clamp_min(1e-9)
+        away = (offset.abs() / room).amax(-1).clamp_min(1.0)
+        return here + offset / away[:, None], away
+
+    def _rate(
+        self, predictor: ContactPredictor, situation: Situation, goals: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Gain for each step towards each goal, and the first step's probability of too much
+        force."""
+        episode = situation.episode
+        commands, away = self._first_step(situation, goals)
+        outcomes, prediction = belief_outcomes(
+            predictor, episode.poses[-1], goals, episode.commands[-1], episode.sensor_std
+        )
+        excess = self._limits.excess_probability(prediction)
+        far = torch.nonzero(away > 1.0)[:, 0]
+        if len(far):
+            start = episode.poses[-1].expand(len(far), 3)
+            before = episode.commands[-1].expand(len(far), 3)
+            nearer = predictor.predict(start, commands[far], before, episode.sensor_std[:3])
+            excess[far] = self._limits.excess_probability(nearer)
+        if self._task is None:
+            return expected_information_gain(outcomes) / away, excess
+        values = self._task.answers(predictor)
+        weights = predictor.weights[:, None]
+        now = (weights * (values - (weights * values).sum(0)).square()).sum(0).mean()
+        fall = now - expected_variance(outcomes, values, torch.ones_like(values[0]))
+        return fall / away, excess
+
+
+def _within(commands: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return torch.minimum(torch.maximum(commands, low), high)
+
+
+def _ranked(gain: Tensor, excess: Tensor, probability: float) -> Tensor:
+    """Indices of commands, the best first: allowed ones by gain, then others by their excess."""
+    allowed = excess <= probability
+    least = float(gain.min())
+    return torch.where(allowed, gain, least - 1.0 - excess).argsort(descending=True)

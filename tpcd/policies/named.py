@@ -1,0 +1,31 @@
+"""Policies by their names, as commands and experiments ask for them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from tpcd.policies.active import ActivePolicy, Task
+from tpcd.policies.basic import GridPolicy, MotionPolicy
+from tpcd.policies.limits import Limits
+from tpcd.policies.protocol import Policy
+from tpcd.random import stream
+from tpcd.truth.motions import expert_motion, press_and_slide, rich_exploration
+from tpcd.truth.scene import Scene
+
+PolicyName = Literal["active", "grid", "random", "expert", "rich"]
+_MOTION_STREAM = 3
+
+
+def make_policy(
+    name: PolicyName, limits: Limits, scene: Scene, seed: int, task: Task | None = None
+) -> Policy:
+    """The policy of a name; only the expert looks at the scene, and there only at the wall."""
+    if name == "active":
+        return ActivePolicy(limits, task=task)
+    if name == "grid":
+        return GridPolicy(MotionPolicy(lambda: press_and_slide(None)), limits)
+    if name == "random":
+        return MotionPolicy(lambda: press_and_slide(stream(seed, _MOTION_STREAM)))
+    if name == "expert":
+        return MotionPolicy(lambda: expert_motion(scene.wall_position))
+    return MotionPolicy(lambda: rich_exploration(stream(seed, _MOTION_STREAM)))

@@ -1,0 +1,48 @@
+"""What exploration needs of an arm, whether real or simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.data.episode import Episode
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was measured once the arm had settled."""
+
+    pose: Float[Tensor, " 3"]
+    """(x, z, phi) of the end effector in the world [m, m, rad]."""
+    wrench: Float[Tensor, " 3"]
+    """(F_x, F_z, tau) that the world exerts on the object [N, N, N·m]."""
+    settled: bool = True
+    """Whether the arm stood still in time."""
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """An arm under Cartesian impedance control that holds an object."""
+
+    def start(self) -> Episode:
+        """Take the free start pose; an episode of that one row, with stiffness and noise."""
+        ...
+
+    def settle(self, command: Float[Tensor, " 3"]) -> Reading:
+        """Go to a command [m, m, rad] and measure once the arm stands still."""
+        ...
+
+    def resume(self, episode: Episode) -> None:
+        """Go on after the rows of an exploration that was stopped."""
+        ...
+
+    def stop(self) -> None:
+        """Stop all motion at once."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the arm."""
+        ...

@@ -29,10 +29,10 @@ class Exploration:
     """Folder for the results; a stopped run in it goes on with --resume."""
     prior: str = "ycb-rich"
     """Shape prior: a checkpoint folder, or the name of a shipped one."""
-    policy: Literal["active", "grid", "random", "expert", "rich"] = "active"
-    """active: the most informative command within reach; grid: of the paper's 27; random: the
-    paper's basic trajectory with noise; expert: one trajectory made with the true wall in
-    view; rich: a script that feels its way."""
+    policy: Literal["active", "lookahead", "grid", "random", "expert", "rich"] = "active"
+    """active: the most informative command within reach; lookahead: the same, two commands deep;
+    grid: the best of the paper's 27; random: the paper's basic trajectory with noise; expert: one
+    trajectory made with the true wall in view; rich: a script that feels its way."""
     steps: int = 15
     """Moves at most."""
     stop_gain: float | None = None

@@ -12,6 +12,7 @@ from torch import Tensor
 from tpcd.belief import EstimatorSettings, SamplerSettings
 from tpcd.belief.belief import Belief, prior_belief
 from tpcd.data.episode import Episode
+from tpcd.information import belief_outcomes, expected_information_gain
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
 from tpcd.policies import (
     ActivePolicy,
@@ -24,6 +25,7 @@ from tpcd.policies import (
 )
 from tpcd.policies.active import Task
 from tpcd.policies.basic import best_within
+from tpcd.policies.lookahead import second_step_gain
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
@@ -206,3 +208,35 @@ def test_the_grid_policy_stays_near_the_basic_trajectory(belief: Belief, episode
     offset: Tensor = (choice.command - wanted).abs()
     assert (offset <= reach + 1e-12).all()
     assert choice.considered == 27
+
+
+def test_looking_ahead_counts_what_is_left_to_learn(belief: Belief, episode: Episode) -> None:
+    """After a command that tells the floor nothing is left; after one in free space, all is."""
+    known = known_but(belief, "floor_height")
+    predictor = ContactPredictor(known, 60)
+    start = row_at(episode, (0.0, 0.15, 0.0))
+    tells, free = (0.0, -0.05, 0.0), (0.0, 0.16, 0.0)
+    commands = torch.tensor([tells, free], dtype=torch.float64)
+    outcomes, _ = belief_outcomes(
+        predictor, start.poses[0], commands, start.commands[0], episode.sensor_std
+    )
+    first = expected_information_gain(outcomes)
+    second = second_step_gain(
+        predictor,
+        outcomes,
+        commands,
+        episode.sensor_std,
+        lambda pose: (pose - 0.2, pose + 0.2),
+        torch.Generator().manual_seed(0),
+    )
+    assert first[1] < 0.01 and first[0] > 2
+    assert second[1] > 0.8 * first[0]
+    # What two readings of the floor tell more than one.
+    assert second[0] < 0.5 * second[1]
+    settings = replace(SMALL, look_ahead=True)
+    choice = ActivePolicy(Limits(step=(0.08, 0.08, 0.01)), settings).choose(
+        Situation(start, known), torch.Generator().manual_seed(0)
+    )
+    assert choice.gain is not None and choice.gain > 0
+    with pytest.raises(ValueError, match="look-ahead"):
+        ActivePolicy(Limits(), settings, Task(start.poses, start.poses))

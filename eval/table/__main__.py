@@ -53,7 +53,8 @@ class Table:
     objects: tuple[str, ...] = ()
     """YCB objects; none named means the 11 that no prior was trained on."""
     rows: tuple[str, ...] = ROWS
-    """Estimator and policy of each row: paper or default / random, grid, expert, active, rich."""
+    """Estimator and policy of each row: paper or default / random, grid, expert, active,
+    lookahead, rich."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of scene, noise, motion and sampler."""
     steps: int = 15
@@ -82,7 +83,7 @@ class Table:
                 raise ValueError(f"truth is {truth!r}, expected one of {', '.join(TRUTHS)}")
         for row in self.rows:
             estimator, _, policy = row.partition("/")
-            policies = ("random", "grid", "expert", "active", "rich")
+            policies = ("random", "grid", "expert", "active", "lookahead", "rich")
             if estimator not in ("paper", "default") or policy not in policies:
                 raise ValueError(f"row is {row!r}, expected for example 'default/active'")
 
@@ -104,7 +105,8 @@ def make_table(config: Table) -> None:
         strategy = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
     fabric = Fabric(accelerator="cpu", devices=config.workers, strategy=strategy)
     fabric.launch()
-    free = ("out", "resume", "overwrite", "workers")
+    # More cells may be asked of an earlier run; what is in a cell must stay the same.
+    free = ("out", "resume", "overwrite", "workers", "truths", "objects", "rows", "seeds")
     folder = config.out
     if fabric.global_rank == 0:
         if config.resume:
@@ -178,7 +180,7 @@ def _report(config: Table, folder: Path) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
     from eval.table.pages import draw_summary
-    from eval.table.summary import compare, summarise
+    from eval.table.summary import compare, printed, summarise
     from tpcd.results import format_table, write_results
 
     keys = {cell.key for cell in plan(config)}

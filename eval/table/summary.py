@@ -51,6 +51,22 @@ def summarise(cells: Sequence[Row]) -> list[Row]:
     return table
 
 
+def printed(line: Row) -> Row:
+    """A row of the table as people read it: mean absolute error ± its deviation over steps."""
+    shown: Row = {key: line[key] for key in ("truth", "row", "cells")}
+    for channel, unit in zip(CHANNELS, UNITS, strict=True):
+        error, spread = line[f"{channel}_{unit}"], line[f"{channel}_sd"]
+        shown[f"{channel} [{unit}]"] = f"{error:.3f} ± {spread:.3f}"
+    shown["x, z 90 % [mm]"] = f"{line['xz_low']:.2f}-{line['xz_high']:.2f}"
+    shown["F of peak"] = f"{line['force_of_peak']:.2%}"
+    for key, name in (("coverage_50", "in 50 %"), ("coverage_90", "in 90 %")):
+        shown[name] = f"{line[key]:.0%}"
+    shown["in 90 %, contact"] = f"{line['contact_90']:.0%}"
+    for key, name in (("choosing_s", "choosing [s]"), ("learning_s", "learning [s]")):
+        shown[name] = f"{line[key]:.2f}"
+    return shown
+
+
 def compare(cells: Sequence[Row], first: str, second: str) -> list[Row]:
     """Ratio of the mean errors of two rows over the cells that both have, for each truth."""
     table = []

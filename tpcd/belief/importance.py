@@ -7,7 +7,8 @@ the prior, which takes part with draws of its own (AMIS: Cornuet et al. 2012).
 
 A trial draw that became the centre of a component has made its own density large, and its
 weight too small. So the trial only shapes the mixture: what counts are new draws from it
-(Marin, Pudlo and Sedki 2019), whose mean weight estimates the evidence without bias.
+(Marin, Pudlo and Sedki 2019), whose mean weight estimates the evidence. Where too few of them
+count, they shape the mixture once more and all is drawn anew.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from torch import Tensor
 from tpcd.information import belief_outcomes, expected_information_gain, expected_variance
 from tpcd.policies.basic import best_within
 from tpcd.policies.limits import Limits
+from tpcd.policies.lookahead import second_step_gain
 from tpcd.policies.protocol import Choice, Situation
 from tpcd.predict import ContactPredictor
 
@@ -46,6 +47,8 @@ class ActiveSettings:
     """Best commands of all that are compared once more."""
     final_particles: int = 300
     """Particles for that."""
+    look_ahead: bool = False
+    """Add to each finalist's gain that of the best command after it."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class Task:
 class ActivePolicy:
     """Chooses the command of the largest expected gain of information within the limits.
 
+    Raises ValueError for look-ahead with a task, whose gain it does not know.
+
     With a `task` it is what the task's predictions depend on that is learnt: the gain is the
     expected fall of their mean variance, in units of the tolerance squared.
     """
@@ -83,6 +88,8 @@ class ActivePolicy:
         self._limits = limits
         self._settings = settings or ActiveSettings()
         self._task = task
+        if task is not None and self._settings.look_ahead:
+            raise ValueError("look-ahead adds up gains of information; leave it out with a task")
 
     def choose(self, situation: Situation, generator: torch.Generator) -> Choice:
         """Search the commands within reach."""
@@ -101,9 +108,30 @@ class ActivePolicy:
         finalists = goals[_ranked(gain, excess, allowed)[: settings.finalists]]
         predictor = ContactPredictor(situation.belief, settings.final_particles)
         gain, excess = self._rate(predictor, situation, finalists)
+        if settings.look_ahead:
+            gain = gain + self._second_gain(situation, finalists, generator)
         best = best_within(gain, excess, allowed)
         command = self._first_step(situation, finalists)[0][best]
         return Choice(command, float(gain[best]), len(goals), float(excess[best]))
+
+    def _second_gain(
+        self, situation: Situation, goals: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """Gain of the best command after the first step towards each goal."""
+        episode = situation.episode
+        predictor = ContactPredictor(situation.belief, self._settings.particles)
+        commands, _ = self._first_step(situation, goals)
+        outcomes, _ = belief_outcomes(
+            predictor, episode.poses[-1], commands, episode.commands[-1], episode.sensor_std
+        )
+        return second_step_gain(
+            predictor,
+            outcomes,
+            commands,
+            episode.sensor_std,
+            lambda pose: self._limits.box(pose, episode.stiffness),
+            generator,
+        )
 
     def _reach(self, situation: Situation, strides: float) -> tuple[Tensor, Tensor]:
         """Lowest and highest goal so many steps away."""

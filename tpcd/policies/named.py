@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from tpcd.policies.active import ActivePolicy, Task
+from tpcd.policies.active import ActivePolicy, ActiveSettings, Task
 from tpcd.policies.basic import GridPolicy, MotionPolicy
 from tpcd.policies.limits import Limits
 from tpcd.policies.protocol import Policy
@@ -12,7 +12,7 @@ from tpcd.random import stream
 from tpcd.truth.motions import expert_motion, press_and_slide, rich_exploration
 from tpcd.truth.scene import Scene
 
-PolicyName = Literal["active", "grid", "random", "expert", "rich"]
+PolicyName = Literal["active", "lookahead", "grid", "random", "expert", "rich"]
 _MOTION_STREAM = 3
 
 
@@ -22,6 +22,8 @@ def make_policy(
     """The policy of a name; only the expert looks at the scene, and there only at the wall."""
     if name == "active":
         return ActivePolicy(limits, task=task)
+    if name == "lookahead":
+        return ActivePolicy(limits, ActiveSettings(look_ahead=True), task)
     if name == "grid":
         return GridPolicy(MotionPolicy(lambda: press_and_slide(None)), limits)
     if name == "random":

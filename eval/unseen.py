@@ -154,7 +154,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
-    from tpcd.commands.prediction import measured_rows, predict_rows, prediction_error
+    from tpcd.commands.prediction import measured_rows, one_step, prediction_error
     from tpcd.predict import CHANNELS, ContactPredictor
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record
@@ -187,9 +187,9 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     predictor = ContactPredictor(belief)
     errors, transforms = [], []
     for test in tests:
-        predicted = predict_rows(predictor, test.measured, of="true", reference=test.true)
-        errors.append(prediction_error(measured_rows(test.true)[1:], predicted.mean))
-        transforms.append(predicted.transform)
+        predicted, rows = one_step(predictor, test.measured, "true"), measured_rows(test.true)[1:]
+        errors.append(prediction_error(rows, predicted.mean))
+        transforms.append(predicted.probability_below(rows))
     error, transform = torch.cat(errors).abs(), torch.cat(transforms)
     inside = ((transform > 0.05) & (transform < 0.95)).double()
     # In free motion the arm reaches its command: those rows are certain, and flatter coverage.

@@ -191,10 +191,7 @@ def _report(config: Table, folder: Path) -> None:
         for other in ("default / random", "default / grid", "default / expert", "paper / grid")
         for line in compare(cells, "default / active", other)
     ]
-    formats = {
-        key: ".3f" for row in table for key, value in row.items() if isinstance(value, float)
-    }
-    text = format_table(table, formats=formats)
+    text = format_table([printed(row) for row in table])
     paired = format_table(pairs, formats=dict.fromkeys(("x, z", "F", "tau"), ".2f"))
     print(f"{text}\n\nratios of mean errors, with 90 % intervals:\n{paired}\n\n{PAPER_NOTE}")
     with SummaryWriter(folder / "tensorboard" / "table") as writer:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.belief import Belief, EstimationStep
-from tpcd.commands.prediction import measured_rows, predict_rows, prediction_error
+from tpcd.commands.prediction import measured_rows, one_step, prediction_error
 from tpcd.exploration import Estimator, explore
 from tpcd.policies import Limits, make_policy
 from tpcd.predict import ContactPredictor
@@ -117,9 +117,9 @@ def _test(belief: Belief, recordings: tuple[Recording, ...]) -> dict[str, Any]:
     predictor = ContactPredictor(belief)
     errors, transforms = [], []
     for test in recordings:
-        predicted = predict_rows(predictor, test.measured, of="true", reference=test.true)
-        errors.append(prediction_error(measured_rows(test.true)[1:], predicted.mean))
-        transforms.append(predicted.transform)
+        predicted, rows = one_step(predictor, test.measured, "true"), measured_rows(test.true)[1:]
+        errors.append(prediction_error(rows, predicted.mean))
+        transforms.append(predicted.probability_below(rows))
     error, transform = torch.cat(errors).abs(), torch.cat(transforms)
     touching = torch.cat(
         [test.true.wrenches[1:].abs().amax(-1) > LEAST_LOAD for test in recordings]

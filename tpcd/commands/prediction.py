@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tpcd.data.episode import Episode
 from tpcd.planar import wrap_angle
-from tpcd.predict import CHANNELS, ContactPredictor
+from tpcd.predict import CHANNELS, ContactPredictor, Prediction
 from tpcd.results import write_text
 
 CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
@@ -49,14 +49,7 @@ def predict_rows(
     `reference` holds the rows to evaluate the distribution function at (default: the
     episode's own); with `of='true'` it should be noise-free.
     """
-    sensor = episode.sensor_std if of == "measured" else None
-    prediction = predictor.predict(
-        episode.poses[:-1],
-        episode.commands[1:],
-        previous=episode.commands[:-1],
-        pose_std=episode.sensor_std[:3],
-        sensor_std=sensor,
-    )
+    prediction = one_step(predictor, episode, of)
     rows = measured_rows(reference or episode)[1:]
     return PredictedRows(
         mean=prediction.mean,
@@ -64,6 +57,19 @@ def predict_rows(
         low=prediction.quantile(0.05),
         high=prediction.quantile(0.95),
         transform=prediction.probability_below(rows),
+    )
+
+
+def one_step(
+    predictor: ContactPredictor, episode: Episode, of: Literal["measured", "true"]
+) -> Prediction:
+    """The distribution of every row but the first, given the row before and the command."""
+    return predictor.predict(
+        episode.poses[:-1],
+        episode.commands[1:],
+        previous=episode.commands[:-1],
+        pose_std=episode.sensor_std[:3],
+        sensor_std=episode.sensor_std if of == "measured" else None,
     )
 
 

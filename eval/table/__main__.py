@@ -8,12 +8,16 @@ itself fits to the object, `quasistatic` the same with the true outline, `mujoco
 the true outline; sensors are noisy in all of them.
 
 Each cell is independent of how many processes share the work, and one line of a
-`cells-*.jsonl`, so that a stopped run goes on where it was. With `fabric run` the processes may
-be on several machines that share the folder.
+`cells-*.jsonl`, so that a stopped run goes on where it was.
+
+python -m eval.table --workers 4 --out runs/table
+PYTHONPATH=. fabric run --accelerator cpu --devices 4 --num-nodes 2 --node-rank 0 \
+    --main-address HOST eval/table/__main__.py --out SHARED/table    # and node-rank 1 elsewhere
 """
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,11 +103,13 @@ def make_table(config: Table) -> None:
     from tpcd.results import continue_run, open_run
 
     torch.set_num_threads(1)
-    strategy: Any = "auto"
-    if config.workers > 1:
-        # Workers end at different times; the first waits for the last.
-        strategy = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
-    fabric = Fabric(accelerator="cpu", devices=config.workers, strategy=strategy)
+    # Workers end at different times; the first waits for the last.
+    parallel: Any = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
+    if "LT_CLI_USED" in os.environ:  # started by `fabric run`, which says how many there are
+        fabric = Fabric(strategy=parallel)
+    else:
+        strategy = parallel if config.workers > 1 else "auto"
+        fabric = Fabric(accelerator="cpu", devices=config.workers, strategy=strategy)
     fabric.launch()
     # More cells may be asked of an earlier run; what is in a cell must stay the same.
     free = ("out", "resume", "overwrite", "workers", "truths", "objects", "rows", "seeds")

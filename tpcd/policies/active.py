@@ -6,8 +6,9 @@ method (Rubinstein 1999). Some are spread evenly; then normal distributions fitt
 best ones are drawn from, and the best few of all are compared with more particles.
 
 What is searched are goals up to a few steps away, since a wall out of reach teaches nothing
-until one is there: a goal n steps away is worth 1 / n of the gain of going there, and the first
-step towards it is what is commanded. Commands that exceed the force limit with more than the
+until one is there. A goal n steps away is worth its gain over the square root of n: divided by n
+itself, the wall was put off again and again for what was near. The first step towards the goal is
+what is commanded. Commands that exceed the force limit with more than the
 set probability are never taken.
 """
 
@@ -33,6 +34,8 @@ class ActiveSettings:
 
     strides: float = 3.0
     """Goals are searched up to so many steps away."""
+    stride_cost: float = 0.5
+    """A goal n steps away is worth its gain over n to this power."""
     first: int = 96
     """Goals spread evenly over what is within reach, half of them within one step."""
     rounds: int = 3
@@ -178,12 +181,12 @@ class ActivePolicy:
             nearer = predictor.predict(start, commands[far], before, episode.sensor_std[:3])
             excess[far] = self._limits.excess_probability(nearer)
         if self._task is None:
-            return expected_information_gain(outcomes) / away, excess
+            return expected_information_gain(outcomes) / away**self._settings.stride_cost, excess
         values = self._task.answers(predictor)
         weights = predictor.weights[:, None]
         now = (weights * (values - (weights * values).sum(0)).square()).sum(0).mean()
         fall = now - expected_variance(outcomes, values, torch.ones_like(values[0]))
-        return fall / away, excess
+        return fall / away**self._settings.stride_cost, excess
 
 
 def _within(commands: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -1,11 +1,15 @@
-"""The main job from end to end: an unknown object, 15 touches, and predictions that hold."""
+"""The main job from end to end: an unknown object, 15 chosen touches, and predictions."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tpcd.cli import check_numbers, run
+
+if TYPE_CHECKING:
+    from tpcd.data.episode import Episode
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,8 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
-    from tpcd.belief import estimate
-    from tpcd.commands.estimation import KnownTruth, run_estimation
+    from tpcd.commands.estimation import KnownTruth
+    from tpcd.commands.exploring import EPISODE_NAME, Stopping, run_exploration
     from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
@@ -61,11 +65,14 @@ def explore_and_test(config: Demo, folder: Path) -> None:
         score_rows,
         write_prediction,
     )
+    from tpcd.exploration import Estimator, explore
     from tpcd.figures.predictions import prediction as prediction_figure
     from tpcd.figures.quality import calibration
     from tpcd.figures.sinks import save_figure
+    from tpcd.policies import ActivePolicy, Limits
     from tpcd.predict import CHANNELS, ContactPredictor
     from tpcd.results import format_table, write_results
+    from tpcd.robot import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record, write_recording
@@ -85,13 +92,18 @@ def explore_and_test(config: Demo, folder: Path) -> None:
         f"unknown object: {config.outline}; simulator of the truth: {kind}; prior: {config.prior}"
     )
 
-    motion = make_motion("rich", scene, config.steps, generator)
-    exploration = record(truth, scene, motion, config.steps, generator)
-    write_recording(exploration, scene, folder / "explore")
+    robot = SimulatedRobot(truth, scene, config.seed)
+
+    def save(episode: Episode) -> None:
+        path = folder / EPISODE_NAME
+        write_recording(robot.recording(episode), scene, path, overwrite=True)
+
     started = time.perf_counter()
-    steps = estimate(exploration.measured, shape, torch.Generator().manual_seed(config.seed))
+    steps = explore(robot, ActivePolicy(Limits()), Estimator(shape), config.seed)
     known = KnownTruth(scene.vertices_ee, scene.theta)
-    belief = run_estimation(steps, exploration.measured, config.prior, folder, known)
+    belief, *_ = run_exploration(
+        steps, Stopping(config.steps), config.prior, folder, save, truth=known
+    )
     seconds = (time.perf_counter() - started) / config.steps
 
     predictor = ContactPredictor(belief)
@@ -125,11 +137,11 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     write_results(folder, table, seeds=[config.seed], seconds_per_step=seconds)
     print(f"\nerror against the truth on {config.tests} x {config.test_steps} held-out steps:")
     print(text)
-    print(f"estimation took {seconds:.2f} s per step")
+    print(f"choosing a move, making it and learning from it took {seconds:.2f} s per step")
     print(
         f"\nresults in {folder}; figures in {folder / 'figures'}\n"
         f"next:  tensorboard --logdir {folder}\n"
-        f"       python scripts/simulate.py --help     make episodes of other objects\n"
+        f"       python scripts/explore.py --help      explore other objects\n"
         f"       python scripts/estimate.py --help     estimate from your own episode"
     )
 

@@ -176,7 +176,7 @@ def _ranks(config: Benchmark) -> list[dict[str, Any]]:
             reference = gain(700, noise)
             for particles in (50, 100, 300):
                 value = gain(particles)
-                correlation = float(spearmanr(value.numpy(), reference.numpy()).statistic)
+                correlation = float(spearmanr(value.numpy(), reference.numpy())[0])
                 lost = float(reference.max() - reference[value.argmax()]) / float(reference.max())
                 found.setdefault(particles, []).append((correlation, lost))
     return [

@@ -98,7 +98,7 @@ def make_table(config: Table) -> None:
 
     import torch
     from lightning.fabric import Fabric
-    from lightning.fabric.strategies import DDPStrategy
+    from lightning.fabric.strategies.ddp import DDPStrategy
 
     from tpcd.results import continue_run, open_run
 

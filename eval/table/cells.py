@@ -75,7 +75,7 @@ def run_cell(
         cell.truth, cell.object, cell.seed, prior, tests, test_steps, vertices
     )
     robot = SimulatedRobot(_truth(cell.truth, scene), scene, cell.seed)
-    policy = make_policy(cell.policy, Limits(), scene, cell.seed)
+    policy = make_policy(cell.policy, Limits(), scene, cell.seed)  # type: ignore[arg-type]
     estimator = Estimator(shape, cell.estimator)  # type: ignore[arg-type]
     row: dict[str, Any] = {**vars(cell), "prior": prior, "moves": [], "mae": [], "sd": []}
     row.update({"coverage_50": [], "coverage_90": [], "contact_90": []})

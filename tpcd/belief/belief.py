@@ -196,6 +196,7 @@ def weighted_quantile(
 
 
 def _belief(cloud: Cloud, target: ContactTarget) -> Belief:
+    assert target.history is not None
     found = target.evaluate(cloud.positions)
     return Belief(
         prior=target.prior,

@@ -24,16 +24,16 @@ class Target(Protocol):
         """Points (count, d) from all over the prior to look for modes from."""
         ...
 
-    def log_prior(self, positions: Tensor) -> Tensor:
+    def log_prior(self, positions: Tensor, /) -> Tensor:
         """Log density (m) of the prior, normalised."""
         ...
 
-    def log_likelihood(self, positions: Tensor, least: Tensor | None) -> Tensor:
+    def log_likelihood(self, positions: Tensor, least: Tensor | None, /) -> Tensor:
         """Log likelihood (m) of the history; a particle that stays below its `least` (m) may
         get -inf."""
         ...
 
-    def curvature(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def curvature(self, positions: Tensor, /) -> tuple[Tensor, Tensor]:
         """Gradient (m, d) and information (m, d, d), positive semi-definite, of the log
         posterior. Only proposals depend on them, so they need not be exact."""
         ...

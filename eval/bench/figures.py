@@ -112,6 +112,8 @@ def growth(table: Rows, axis: str, targets: Mapping[int, float]) -> Figure:
         )
     panel.set_xscale("log")
     panel.set_yscale("log")
+    panel.set_xticks(values, [str(value) for value in values])
+    panel.minorticks_off()
     panel.set_xlabel(f"{axis} [–]")
     panel.set_ylabel("wall time of a choice [s]")
     legend_below(figure, entries)

@@ -18,6 +18,8 @@ from tpcd.figures.sinks import ImageWriter, save_figure
 from tpcd.figures.style import SERIES, legend_below, panels
 from tpcd.predict import CHANNELS, ContactPredictor
 
+POLICIES = ("active", "random", "expert", "lookahead", "grid", "rich")
+"""Each has a colour of its own, whoever estimates."""
 PAPER_ERROR = 6.8
 """Middle of what the paper reports for x and z [mm]."""
 
@@ -71,13 +73,13 @@ def draw_summary(cells: Sequence[Row], folder: Path, writer: ImageWriter) -> Non
 def _curve_figure(cells: Sequence[Row], truth: str) -> Any:
     figure, (panel,) = panels(1, 1, 6.0, 4.0)
     entries = {}
-    names = list(curves(cells, truth).items())
-    for i, (name, (moves, errors)) in enumerate(names):
-        style = "--" if name.startswith("paper") else "-"
-        (entries[name],) = panel.plot(
-            moves, errors, style, color=SERIES[i % len(SERIES)], marker=".", linewidth=1.6
-        )
-    entries["the paper after 15 moves"] = panel.axhline(PAPER_ERROR, color="0.5", linestyle=":")
+    for name, (moves, errors) in curves(cells, truth).items():
+        estimator, policy = name.split(" / ")
+        style, colour = "--" if estimator == "paper" else "-", SERIES[POLICIES.index(policy)]
+        (entries[name],) = panel.plot(moves, errors, style, color=colour, marker=".", linewidth=1.6)
+    entries["what the paper reports, 15 moves"] = panel.axhline(
+        PAPER_ERROR, color="0.5", linestyle=":"
+    )
     panel.set_yscale("log")
     panel.set_xlabel("exploration moves")
     panel.set_ylabel("mean error of x and z [mm]")

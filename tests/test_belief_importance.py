@@ -10,7 +10,8 @@ from linear_model import DIMENSION, LinearModel
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
-from tpcd.belief.importance import assimilate, cut_off, draw_pool, truncate
+from tpcd.belief.importance import assimilate, draw_pool
+from tpcd.belief.pool import cut_off, truncate
 
 SETTINGS = SamplerSettings(particles=2000, draws=6000)
 FEW = SamplerSettings(particles=500, places=20, fresh_modes=20, modes=5)

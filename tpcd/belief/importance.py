@@ -17,57 +17,29 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, SamplerSettings, Target
 from tpcd.belief.modes import CURVATURE_COST, climb, climbing_cost, find_modes
 from tpcd.belief.pareto import tail_shape
-from tpcd.belief.proposals import CurvedMixture, curved_mixture
-from tpcd.belief.resampling import (
-    effective_sample_size,
-    normalise_log_weights,
-    systematic_resample,
+from tpcd.belief.pool import (
+    Pool,
+    Proposal,
+    cut_off,
+    finite,
+    known_weights,
+    threshold,
+    truncate,
+    weigh,
 )
+from tpcd.belief.proposals import CurvedMixture, curved_mixture
+from tpcd.belief.resampling import effective_sample_size, systematic_resample
 
-_HOPELESS = 20.0
-"""A draw whose log weight is so far below the best one counts as impossible."""
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
 _FEWEST_PLACES = 300.0
 """Places are chosen as if no draw had more than this share of the weight (1 / count), so that
 components also go where the draws found little so far."""
-
-
-@dataclass(frozen=True)
-class Pool:
-    """The draws that count, from the mixture that the rounds arrived at, and their weights."""
-
-    positions: Float[Tensor, "n d"]
-    log_likelihood: Float[Tensor, " n"]
-    log_weights: Float[Tensor, " n"]
-    """Log of posterior (not normalised) over proposal density."""
-    modes: Float[Tensor, "k d"]
-    """Where points climbed to, from which the next datum starts."""
-    shares: Float[Tensor, " t"]
-    """What draws with each damping were worth."""
-    evaluations: int
-
-    @property
-    def effective_sample_size(self) -> float:
-        """Kish's number of the draws."""
-        return effective_sample_size(_weights(self.log_weights))
-
-    @property
-    def log_evidence(self) -> float:
-        """Log of the mean weight."""
-        return float(torch.logsumexp(self.log_weights, 0)) - math.log(len(self.log_weights))
-
-    @property
-    def log_evidence_std(self) -> float:
-        """Its standard error, from the variance of the weights."""
-        spread = 1.0 / self.effective_sample_size - 1.0 / len(self.log_weights)
-        return math.sqrt(max(spread, 0.0))
 
 
 def assimilate(
@@ -82,7 +54,7 @@ def assimilate(
     Raises ValueError where no particle can explain the datum at all.
     """
     pool = draw_pool(cloud, target, datum, settings, generator)
-    weights = truncate(_weights(pool.log_weights))
+    weights = truncate(known_weights(pool.log_weights))
     index, counts = systematic_resample(weights, settings.particles, generator).unique(
         return_counts=True
     )
@@ -129,7 +101,7 @@ def draw_pool(
     for left in reversed(range(settings.rounds)):
         trial, by_damping = trial.add(target, mixture, generator)
         log_weights = trial.log_weights
-        weights = cut_off(_weights(log_weights), math.sqrt(len(log_weights)))
+        weights = cut_off(known_weights(log_weights), math.sqrt(len(log_weights)))
         worth = weights @ by_damping.softmax(-1).nan_to_num(0.0)
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
         if left == 0:
@@ -139,21 +111,22 @@ def draw_pool(
         mixture = curved_mixture(centres, *target.curvature(centres), counts)
         evaluations += CURVATURE_COST * len(centres)
     evaluations += len(trial.positions)
-    mixture = trial.mixture
-    assert mixture is not None
+    assert trial.mixture is not None
+    proposal = Proposal(trial.mixture, trial.from_prior)
+    best = float(trial.log_weights.max())
     for left in reversed(range(settings.attempts)):
-        drawn = trial.draw(target, mixture, settings.draws, generator)
-        positions, log_likelihood, log_weights = drawn
+        drawn = weigh(target, proposal, settings.draws, best, generator)
+        positions, *_, log_weights = drawn
         evaluations += len(positions)
-        if left == 0 or effective_sample_size(_weights(log_weights)) >= settings.wanted:
+        if left == 0 or effective_sample_size(known_weights(log_weights)) >= settings.wanted:
             break
         # What the draws found shapes the mixture, from which all is drawn anew.
         centres = positions[_spread_choice(log_weights, settings.places, generator)]
         counts = _counts(shares, settings.draws_per_place)
         fresh = curved_mixture(centres, *target.curvature(centres), counts)
-        mixture = CurvedMixture.joined([mixture, fresh])
+        proposal = Proposal(CurvedMixture.joined([proposal.mixture, fresh]), trial.from_prior)
         evaluations += CURVATURE_COST * len(centres)
-    return Pool(positions, log_likelihood, log_weights, peaks.points, shares, evaluations)
+    return Pool(*drawn, peaks.points, shares, evaluations)
 
 
 def _counts(shares: Tensor, total: int) -> Tensor:
@@ -162,33 +135,6 @@ def _counts(shares: Tensor, total: int) -> Tensor:
     missing = int(total - whole.sum())
     whole[(shares * total - whole).topk(missing).indices] += 1
     return whole
-
-
-def _weights(log_weights: Tensor) -> Tensor:
-    if not bool((log_weights > -torch.inf).any()):
-        raise ValueError(
-            "no particle explains the new datum (every likelihood is zero or NaN); "
-            "check units and frames of the data against the priors"
-        )
-    return normalise_log_weights(log_weights)
-
-
-def truncate(weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Weights of which none counts more than sqrt(n) times the mean one: a bias that vanishes
-    with n, against draws in places that the mixture hardly reaches (Ionides 2008)."""
-    kept = weights.clamp_max(weights.mean() * math.sqrt(len(weights)))
-    return kept / kept.sum()
-
-
-def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
-    """Weights of which none is more than 1 / count of their sum, by and large.
-
-    The cut is repeated, since each one lowers the sum; n weights must be more than `count`.
-    """
-    for _ in range(30):
-        weights = weights.clamp_max(1.0 / count)
-        weights = weights / weights.sum()
-    return weights
 
 
 @dataclass(frozen=True)
@@ -205,8 +151,7 @@ class _Draws:
 
     @property
     def log_weights(self) -> Tensor:
-        found = self.log_prior + self.log_likelihood - self.log_sum
-        found = torch.where(torch.isfinite(found), found, -torch.inf)
+        found = finite(self.log_prior + self.log_likelihood - self.log_sum)
         return found + math.log(len(self.positions))
 
     def add(
@@ -224,9 +169,8 @@ class _Draws:
         log_sum = torch.logaddexp(
             torch.cat((self.log_sum, log_sum)), torch.logsumexp(by_damping, -1)
         )
-        best = self.log_weights.max() - math.log(len(self.positions))
-        least = best - _HOPELESS + log_sum[-len(new) :] - log_prior
-        least = torch.where(torch.isfinite(log_prior), least, torch.inf)
+        best = float(self.log_weights.max()) - math.log(len(self.positions))
+        least = threshold(best, log_sum[-len(new) :], log_prior)
         draws = _Draws(
             positions,
             torch.cat((self.log_prior, log_prior)),
@@ -236,33 +180,6 @@ class _Draws:
             self.from_prior,
         )
         return draws, by_damping
-
-    def draw(
-        self, target: Target, mixture: CurvedMixture, count: int, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """So many draws from prior and components together: positions, log likelihoods and log
-        weights."""
-        total = float(mixture.counts.sum()) + self.from_prior
-        from_prior = round(count * self.from_prior / total)
-        positions = torch.cat(
-            (
-                target.sample(from_prior, generator),
-                mixture.draw_some(count - from_prior, generator),
-            )
-        )
-        log_prior = target.log_prior(positions)
-        density = torch.logaddexp(
-            mixture.log_sum(positions), log_prior + math.log(self.from_prior)
-        ) - math.log(total)
-        least = self.log_weights.max() - _HOPELESS + density - log_prior
-        least = torch.where(torch.isfinite(log_prior), least, torch.inf)
-        log_likelihood = target.log_likelihood(positions, least)
-        log_weights = log_prior + log_likelihood - density
-        return (
-            positions,
-            log_likelihood,
-            torch.where(torch.isfinite(log_weights), log_weights, -torch.inf),
-        )
 
 
 def _of_prior(target: Target, count: int, generator: torch.Generator) -> _Draws:
@@ -288,5 +205,5 @@ def _follow(
 
 def _spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices drawn by weight, none of which may take more than a small share."""
-    weights = cut_off(_weights(log_weights), _FEWEST_PLACES)
+    weights = cut_off(known_weights(log_weights), _FEWEST_PLACES)
     return torch.multinomial(weights, count, replacement=True, generator=generator)

@@ -105,12 +105,12 @@ def make_table(config: Table) -> None:
     torch.set_num_threads(1)
     # Workers end at different times; the first waits for the last.
     parallel: Any = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
-    if "LT_CLI_USED" in os.environ:  # started by `fabric run`, which says how many there are
+    if "LT_CLI_USED" in os.environ:  # `fabric run` has made the processes and says how many
         fabric = Fabric(strategy=parallel)
     else:
         strategy = parallel if config.workers > 1 else "auto"
         fabric = Fabric(accelerator="cpu", devices=config.workers, strategy=strategy)
-    fabric.launch()
+        fabric.launch()
     # More cells may be asked of an earlier run; what is in a cell must stay the same.
     free = ("out", "resume", "overwrite", "workers", "truths", "objects", "rows", "seeds")
     folder = config.out

@@ -31,7 +31,8 @@ def draw_cell(outcome: Outcome, cell: Cell, folder: Path, writer: ImageWriter) -
     known = KnownTruth(outcome.scene.vertices_ee, outcome.scene.theta)
     history = [step_row(step) for step in outcome.steps]
     explored = outcome.exploration
-    draw_estimation(belief, history, explored.measured, folder, writer, known, prefix)
+    heading = f"{cell.object}, {cell.truth}"
+    draw_estimation(belief, history, explored.measured, folder, writer, known, prefix, heading)
     predictor = ContactPredictor(belief)
     for name, recording, text in (
         ("exploration", explored, "exploration moves, explained by the final belief"),
@@ -46,7 +47,7 @@ def draw_cell(outcome: Outcome, cell: Cell, folder: Path, writer: ImageWriter) -
             f"{cell.object}: {text}",
             rows_are="true",
         )
-        save_figure(figure, folder, f"{prefix}{name}", writer)
+        save_figure(figure, folder, f"{prefix}{name}", writer, heading=heading)
 
 
 def draw_summary(cells: Sequence[Row], folder: Path, writer: ImageWriter) -> None:

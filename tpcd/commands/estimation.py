@@ -263,8 +263,12 @@ def draw_estimation(
     writer: Any,
     truth: KnownTruth | None,
     prefix: str = "",
+    heading: str = "figures",
 ) -> None:
-    """Figures of what was learnt: parameters step by step, the outline, and the scene."""
+    """Figures of what was learnt: parameters step by step, the outline, and the scene.
+
+    `prefix` leads their names, `heading` is where TensorBoard shows them.
+    """
     z = belief.prior.shape.latent_dim
     names, units = belief.prior.names[z:], belief.prior.units[z:]
     columns = {
@@ -276,7 +280,7 @@ def draw_estimation(
     figure = estimation_progress(
         torch.arange(last + 1).numpy(), **columns, names=names, units=units, truth=known
     )
-    save_figure(figure, folder, f"{prefix}estimation", writer, last)
+    save_figure(figure, folder, f"{prefix}estimation", writer, last, heading)
     chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()
     parameters = belief.parameters
     with torch.no_grad():
@@ -284,7 +288,7 @@ def draw_estimation(
     points = place_points(outline, parameters.scale[chosen], parameters.mount[chosen])
     vertices = None if truth is None else truth.vertices_ee.numpy()
     figure = outline_belief(points.double().numpy(), belief.weights[chosen].numpy(), vertices)
-    save_figure(figure, folder, f"{prefix}outline", writer, last)
+    save_figure(figure, folder, f"{prefix}outline", writer, last, heading)
     surfaces = {}
     for name in ("floor_height", "wall_position"):
         i = names.index(name)
@@ -299,4 +303,4 @@ def draw_estimation(
         true_wall=None if truth is None else truth.scene["wall_position"],
         commands=episode.commands.numpy(),
     )
-    save_figure(figure, folder, f"{prefix}scene", writer, last)
+    save_figure(figure, folder, f"{prefix}scene", writer, last, heading)

@@ -28,11 +28,12 @@ def save_figure(
     name: str,
     writer: ImageWriter | None = None,
     step: int = 0,
+    heading: str = "figures",
 ) -> Path:
     """Write `folder/name.png`, and the same image to TensorBoard where a writer is given.
 
-    `name` is a file name without its ending; the tag `figures/name` puts all figures of a run
-    under one heading. The file appears complete or not at all.
+    `name` is a file name without its ending; the tag `heading/name` puts the figures of a run, or
+    of one object of it, under one heading. The file appears complete or not at all.
     """
     if not name or Path(name).name != name:
         raise ValueError(f"name of a figure is {name!r}, expected a file name without a folder")
@@ -48,5 +49,5 @@ def save_figure(
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         image = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        writer.add_image(f"figures/{name}", image, step, dataformats="HWC")
+        writer.add_image(f"{heading}/{name}", image, step, dataformats="HWC")
     return path

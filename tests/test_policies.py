@@ -27,6 +27,7 @@ from tpcd.policies.active import Task
 from tpcd.policies.basic import best_within
 from tpcd.policies.lookahead import second_step_gain
 from tpcd.predict import ContactPredictor
+from tpcd.robot import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.truth.motions import press_and_slide, rich_exploration
@@ -240,3 +241,40 @@ def test_looking_ahead_counts_what_is_left_to_learn(belief: Belief, episode: Epi
     assert choice.gain is not None and choice.gain > 0
     with pytest.raises(ValueError, match="look-ahead"):
         ActivePolicy(Limits(), settings, Task(start.poses, start.poses))
+
+
+@pytest.mark.parametrize("name", ["expert", "random", "rich"])
+def test_scripts_find_floor_and_wall(name: str, scene: Scene) -> None:
+    policy = make_policy(name, Limits(), scene, seed=3)  # type: ignore[arg-type]
+    assert isinstance(policy, MotionPolicy)
+    robot = SimulatedRobot(make_truth(scene, "quasistatic"), scene, 3)
+    rows = robot.start()
+    for _ in range(15):
+        command = policy.next_command(rows)
+        reading = robot.settle(command)
+        rows = rows.with_row(command, reading.pose, reading.wrench)
+    true = robot.recording(rows).true
+    floor, wall = zip(*(scene.clearances(pose) for pose in true.poses[1:]), strict=True)
+    assert min(map(abs, floor)) < 2e-4 and min(map(abs, wall)) < 2e-4
+    assert (true.wrenches[:, :2].abs() < 10.0).all()
+
+
+def test_the_basic_trajectory_is_the_random_one_without_noise(scene: Scene) -> None:
+    """On the same rows, the random policy's commands scatter about the basic ones."""
+    basic = MotionPolicy(lambda: press_and_slide(None))
+    generator = torch.Generator().manual_seed(0)
+    offsets = []
+    robot = SimulatedRobot(make_truth(scene, "quasistatic"), scene, 4)
+    rows = robot.start()
+    for _ in range(8):
+        command = basic.next_command(rows)
+        reading = robot.settle(command)
+        rows = rows.with_row(command, reading.pose, reading.wrench)
+    for seed in range(40):
+        generator = torch.Generator().manual_seed(seed)
+        noisy = MotionPolicy(lambda g=generator: press_and_slide(g)).next_command(rows)
+        offsets.append(noisy - basic.next_command(rows))
+    spread = torch.stack(offsets)
+    std = torch.tensor([0.005, 0.005, 0.04], dtype=torch.float64)
+    assert (spread.mean(0).abs() < 4 * std / 40**0.5).all()
+    assert (spread.std(0) / std - 1).abs().max() < 0.4

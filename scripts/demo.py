@@ -99,11 +99,9 @@ def explore_and_test(config: Demo, folder: Path) -> None:
         write_recording(robot.recording(episode), scene, path, overwrite=True)
 
     started = time.perf_counter()
-    steps = explore(robot, ActivePolicy(Limits()), Estimator(shape), config.seed)
+    steps = explore(robot, ActivePolicy(Limits()), Estimator(shape), config.seed, on_row=save)
     known = KnownTruth(scene.vertices_ee, scene.theta)
-    belief, *_ = run_exploration(
-        steps, Stopping(config.steps), config.prior, folder, save, truth=known
-    )
+    belief, *_ = run_exploration(steps, Stopping(config.steps), config.prior, folder, truth=known)
     seconds = (time.perf_counter() - started) / config.steps
 
     predictor = ContactPredictor(belief)

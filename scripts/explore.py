@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
+    from tpcd.data.episode import Episode
     from tpcd.policies.active import Task
 
 SCENE_STREAM = 0
@@ -36,7 +37,8 @@ class Exploration:
     steps: int = 15
     """Moves at most."""
     stop_gain: float | None = None
-    """Stop once the best command promises less than this [nat; with --task: tolerances squared]."""
+    """Stop before a command that promises less than this [nat; with --task: mean square of the
+    tolerance 1 mm, 1 mm, 5 mrad]; a goal n steps away counts over the root of n."""
     task: Path | None = None
     """Episode whose motions are to be predicted: learn what they depend on."""
     stop_error: float | None = None
@@ -70,6 +72,13 @@ class Exploration:
         )
         if self.stop_error is not None and self.task is None:
             raise ValueError("stop_error needs a task to predict; name an episode with --task")
+        weighs = self.policy in ("active", "lookahead", "grid")
+        if self.stop_gain is not None and not weighs:
+            raise ValueError(f"stop_gain needs a policy that weighs commands, not {self.policy}")
+        if self.task is not None and self.stop_error is None and self.policy != "active":
+            raise ValueError(
+                f"a task changes nothing with {self.policy}; add stop_error, or use active"
+            )
 
 
 def explore_object(config: Exploration) -> None:
@@ -88,7 +97,7 @@ def explore_object(config: Exploration) -> None:
     from tpcd.exploration import Estimator, explore
     from tpcd.policies import Limits, make_policy
     from tpcd.random import stream
-    from tpcd.results import continue_run, format_table, run_folder, write_results
+    from tpcd.results import RESULTS_FILE, continue_run, format_table, run_folder, write_results
     from tpcd.robot import SimulatedRobot
     from tpcd.shape.checkpoint import load_prior
     from tpcd.shape.named import find_outline
@@ -124,25 +133,31 @@ def explore_object(config: Exploration) -> None:
             episode = read_episode(path)
             state = load_state(folder, episode, growing=True)
             belief = None if state is None else load_belief(folder)
-        if episode is not None and state is not None and state.index >= config.steps:
+        done = 0 if state is None else state.index
+        if done >= config.steps and (folder / RESULTS_FILE).is_file():
             raise ValueError(f"{config.out} has all of its {config.steps} moves; raise --steps")
 
-        def save(rows) -> None:
+        def save(rows: Episode) -> None:
             write_together(recording_contents(robot.recording(rows), scene, path))
 
         steps = explore(
-            robot, policy, Estimator(shape, config.estimator), config.seed, episode, belief, state
-        )
-        belief, episode, reason = run_exploration(
-            steps,
-            Stopping(config.steps, config.stop_gain, config.stop_error),
-            config.prior,
-            folder,
-            save,
-            task,
-            KnownTruth(scene.vertices_ee, scene.theta),
-            done=0 if state is None else state.index,
-        )
+            robot, policy, Estimator(shape, config.estimator), config.seed, episode, belief, state,
+            save, config.stop_gain or 0.0,
+        )  # fmt: skip
+        try:
+            belief, episode, reason = run_exploration(
+                steps,
+                Stopping(config.steps, config.stop_error),
+                config.prior,
+                folder,
+                episode,
+                task,
+                KnownTruth(scene.vertices_ee, scene.theta),
+                done,
+            )
+        finally:
+            robot.stop()
+            robot.close()
         table = parameter_rows(belief)
         for row in table:
             row["true"] = scene.theta.get(row["parameter"])

@@ -110,15 +110,33 @@ def test_a_simulated_robot_reads_the_truth_with_noise_and_refuses_other_rows(sce
         robot_in(scene).resume(moved)
 
 
-def test_stopping_says_why(scene: Scene) -> None:
-    step = first_steps(1, explore(robot_in(scene), policy_of("active", scene),
-                                  estimator_of("default"), 4))[0]  # fmt: skip
-    assert Stopping(steps=5).reason(step, None) is None
-    assert Stopping(steps=1).reason(step, None) == "all 1 moves are made"
-    assert step.choice.gain is not None
-    low = Stopping(steps=5, gain=0.5 * step.choice.gain)
-    assert low.reason(step, None) is None
-    assert "promised only" in (replace(low, gain=2 * step.choice.gain).reason(step, None) or "")
+def test_rows_are_handed_out_before_they_are_learnt_from(scene: Scene) -> None:
+    seen: list[int] = []
+
+    class Unlearnable(Estimator):
+        def steps(self, *arguments):
+            raise ValueError("no particle explains")
+
+    shape = estimator_of("default").shape
+    steps = explore(
+        robot_in(scene), policy_of("random", scene), Unlearnable(shape), 4,
+        on_row=lambda rows: seen.append(len(rows)),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="no particle"):
+        next(steps)
+    assert seen == [2]
+
+
+def test_it_stops_before_a_move_that_promises_too_little(scene: Scene) -> None:
+    estimator, policy = estimator_of("default"), policy_of("active", scene)
+    first = next(explore(robot_in(scene), policy, estimator, 4))
+    assert first.choice.gain is not None
+    robot = robot_in(scene)
+    least = 1.1 * first.choice.gain
+    assert list(explore(robot, policy, estimator, 4, least_gain=least)) == []
+    assert len(robot.recording(robot.start()).true) == 1
+    assert Stopping(steps=5).reason(first, None) is None
+    assert Stopping(steps=1).reason(first, None) == "all 1 moves are made"
 
 
 ARGUMENTS = ("--outline", "soup_can", "--prior", PRIOR, "--truth", "quasistatic")
@@ -139,6 +157,12 @@ def test_the_command_explores_stops_and_goes_on(
     for name in ("estimation", "outline", "scene"):
         assert (out / "figures" / f"{name}.png").is_file()
     assert json.loads((out / "results.json").read_text())["moves"] == 2
+    # Stopped after its last move, it is ended from what it kept.
+    (out / "results.json").rename(tmp_path / "results.json")
+    (out / "summary.json").unlink()
+    assert call("explore", *ARGUMENTS, "--steps", "2", "--out", str(out), "--resume") == 0
+    assert json.loads((out / "results.json").read_text())["moves"] == 2
+    assert (out / "summary.json").is_file()
     # Asked for more, it goes on from there.
     capsys.readouterr()
     assert call("explore", *ARGUMENTS, "--steps", "2", "--out", str(out), "--resume") == 2
@@ -147,12 +171,14 @@ def test_the_command_explores_stops_and_goes_on(
     longer: Episode = read_episode(out / "explore.csv")
     torch.testing.assert_close(longer.poses[:3], episode.poses)
     assert len((out / "steps.jsonl").read_text().splitlines()) == 3
+    assert json.loads((out / "results.json").read_text())["config"]["steps"] == 3
 
 
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
         (("--stop_error", "1e-3"), "needs a task"),
+        (("--policy", "expert", "--stop_gain", "1"), "stop_gain needs a policy"),
         (("--force_limit", "0"), "force_limit"),
         (("--step_limit", "0", "0", "0"), "step"),
         (("--workspace_low", "1", "1", "1"), "workspace"),

@@ -58,6 +58,21 @@ def test_pairs_are_compared_over_common_cells_only() -> None:
     assert compare(CELLS, "default / active", "paper / grid") == []
 
 
+def test_cells_with_other_decoded_outlines_are_no_pairs() -> None:
+    decoded = [{**row, "truth": "decoded", "prior": row["policy"]} for row in CELLS]
+    assert compare(decoded, "default / active", "default / random") == []
+    same = [{**row, "prior": "ycb21-z2"} for row in decoded]
+    assert compare(same, "default / active", "default / random")[0]["pairs"] == 4
+
+
+def test_an_unknown_object_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    if ycb_folder() is None:
+        return
+    with pytest.raises(ValueError, match="object is 'teapot'"):
+        make_table(Table(out=tmp_path / "table", objects=("teapot",)))
+    assert not (tmp_path / "table").exists()
+
+
 def test_curves_follow_the_moves() -> None:
     moves, errors = curves(CELLS, "mujoco")["default / random"]
     assert moves.tolist() == [1, 2]

@@ -7,7 +7,7 @@ was measured and learnt is handed out after every step, so that nothing is lost 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -70,12 +70,15 @@ def explore(
     episode: Episode | None = None,
     belief: Belief | None = None,
     state: EstimatorState | None = None,
+    on_row: Callable[[Episode], None] | None = None,
+    least_gain: float = 0.0,
 ) -> Iterator[ExplorationStep]:
-    """Explore without end; the caller stops when it has seen enough.
+    """Explore until the best command promises less than `least_gain`, or the caller has enough.
 
     With `episode`, `belief` and `state` of an exploration that was stopped it goes on after
     their rows, with the very choices it would have made; rows that were measured but not yet
-    learnt from come first. Raises ValueError where no particle can explain what was measured.
+    learnt from come first. `on_row` is given all rows as soon as the last one is measured. Raises
+    ValueError where no particle can explain what was measured.
     """
     generator = torch.Generator().manual_seed(seed)
     if episode is None:
@@ -95,8 +98,12 @@ def explore(
         started = time.perf_counter()
         choice = policy.choose(Situation(episode, belief), stream(seed, _POLICY_STREAM, row))
         seconds = time.perf_counter() - started
+        if choice.gain is not None and choice.gain < least_gain:
+            return
         reading = robot.settle(choice.command)
         episode = episode.with_row(choice.command, reading.pose, reading.wrench)
+        if on_row is not None:
+            on_row(episode)
         (step,) = estimator.steps(episode, generator, state)
         belief, state = step.belief, step.state
         yield ExplorationStep(choice, seconds, reading.settled, step, episode)

@@ -8,5 +8,7 @@ import torch
 
 def stream(*names: int) -> torch.Generator:
     """A generator of its own for every sequence of whole numbers >= 0 (seed, row, ...)."""
-    state = np.random.SeedSequence([int(name) for name in names]).generate_state(1, np.uint64)
+    # Their number leads, since a seed sequence takes trailing zeros for nothing.
+    entropy = [len(names), *(int(name) for name in names)]
+    state = np.random.SeedSequence(entropy).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))

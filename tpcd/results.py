@@ -144,7 +144,7 @@ def continue_run(
     """Return the folder of a run that was stopped, to go on in it.
 
     Raises `RunError` when the folder holds no run, or one of another configuration; entries
-    named in `free` may differ.
+    named in `free` may differ, and the run's `config.yaml` takes their new values.
     """
     import yaml
 
@@ -158,6 +158,9 @@ def continue_run(
         raise RunError(
             folder, f"holds a run with another {', '.join(differing)}", "name a new folder"
         )
+    if any(now[key] != before.get(key) for key in now if key not in ("resume", "overwrite")):
+        text = yaml.safe_dump({**now, "resume": False, "overwrite": False}, sort_keys=False)
+        write_text(folder / CONFIG_FILE, text)
     return folder
 
 

@@ -82,6 +82,8 @@ class Table:
 
     def __post_init__(self) -> None:
         check_numbers(self, least=dict.fromkeys(("steps", "tests", "test_steps", "workers"), 1))
+        if not self.seeds or not self.rows or not self.truths:
+            raise ValueError("seeds, rows or truths are empty, expected at least one of each")
         for truth in self.truths:
             if truth not in TRUTHS:
                 raise ValueError(f"truth is {truth!r}, expected one of {', '.join(TRUTHS)}")
@@ -101,8 +103,21 @@ def make_table(config: Table) -> None:
     from lightning.fabric.strategies.ddp import DDPStrategy
 
     from tpcd.results import continue_run, open_run
+    from tpcd.shape.ycb import load_ycb
 
     torch.set_num_threads(1)
+    known = load_ycb("main")
+    for name in config.objects:
+        if name not in known:
+            raise ValueError(f"object is {name!r}, expected one of {', '.join(sorted(known))}")
+    # Before there are other processes, so that a folder in use is one line and not a crash.
+    if int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))) == 0:
+        if config.resume:
+            # More cells may be asked of an earlier run; what is in a cell must stay the same.
+            cells = ("truths", "objects", "rows", "seeds")
+            continue_run(config.out, config, ("out", "resume", "overwrite", "workers", *cells))
+        else:
+            open_run(config.out, "python -m eval.table", config, config.overwrite)
     # Workers end at different times; the first waits for the last.
     parallel: Any = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
     if "LT_CLI_USED" in os.environ:  # `fabric run` has made the processes and says how many
@@ -111,15 +126,8 @@ def make_table(config: Table) -> None:
         strategy = parallel if config.workers > 1 else "auto"
         fabric = Fabric(accelerator="cpu", devices=config.workers, strategy=strategy)
         fabric.launch()
-    # More cells may be asked of an earlier run; what is in a cell must stay the same.
-    free = ("out", "resume", "overwrite", "workers", "truths", "objects", "rows", "seeds")
-    folder = config.out
-    if fabric.global_rank == 0:
-        if config.resume:
-            folder = continue_run(config.out, config, free)
-        else:
-            folder = open_run(config.out, "python -m eval.table", config, config.overwrite)
     fabric.barrier()
+    folder = config.out
     _run_missing(config, folder, fabric.global_rank, fabric.world_size)
     fabric.barrier()
     if fabric.global_rank == 0:

@@ -88,7 +88,8 @@ def compare(cells: Sequence[Row], first: str, second: str) -> list[Row]:
 
 
 def paired(cells: Sequence[Row], truth: str, first: str, second: str) -> list[tuple[Row, Row]]:
-    """Cells of two rows that share object and seed."""
+    """Cells of two rows that share the world: truth, object, seed, and for decoded outlines the
+    prior that they are decoded with."""
     by_place = {
         (label(row), row["object"], row["seed"]): row for row in cells if row["truth"] == truth
     }
@@ -97,6 +98,10 @@ def paired(cells: Sequence[Row], truth: str, first: str, second: str) -> list[tu
         (by_place[(first, *place)], by_place[(second, *place)])
         for place in places
         if (second, *place) in by_place
+        and (
+            truth != "decoded"
+            or by_place[(first, *place)]["prior"] == by_place[(second, *place)]["prior"]
+        )
     ]
 
 

@@ -116,7 +116,7 @@ class CloudInfo:
     draws: int
     """Draws that were weighted."""
     effective_sample_size: float
-    """Of all draws; with the paper's filter the smallest one met."""
+    """Of all draws, before the largest weights are truncated; of the paper's particles."""
     tail_shape: float
     """Shape k of the distribution of the largest weights: over 0.7 they are not to be trusted
     (NaN with the paper's filter)."""

@@ -113,8 +113,8 @@ def known_weights(log_weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
 
 
 def truncate(weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Weights of which none counts more than sqrt(n) times the mean one: a bias that vanishes
-    with n, against draws in places that the mixture hardly reaches (Ionides 2008)."""
+    """Weights cut to sqrt(n) times their mean, and normalised again: a bias that vanishes with n,
+    against draws in places that the mixture hardly reaches (Ionides 2008)."""
     kept = weights.clamp_max(weights.mean() * math.sqrt(len(weights)))
     return kept / kept.sum()
 

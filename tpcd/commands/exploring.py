@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +23,6 @@ class Stopping:
 
     steps: int
     """Moves at most."""
-    gain: float | None = None
-    """Stop once the best command promises less than this (None: never)."""
     position_error: float | None = None
     """Stop once the belief expects its predictions of the task to be this good [m]."""
 
@@ -33,8 +32,6 @@ class Stopping:
             error = task.predicted_error(ContactPredictor(step.estimation.belief))[:2].max()
             if float(error) <= self.position_error:
                 return f"the task's poses are expected within {1e3 * float(error):.2f} mm"
-        if self.gain is not None and step.choice.gain is not None and step.choice.gain < self.gain:
-            return f"the best command promised only {step.choice.gain:.2f}"
         if len(step.episode) > self.steps:
             return f"all {self.steps} moves are made"
         return None
@@ -45,7 +42,7 @@ def run_exploration(
     stopping: Stopping,
     prior_name: str,
     folder: Path,
-    save_episode: Callable[[Episode], None],
+    episode: Episode | None = None,
     task: Task | None = None,
     truth: KnownTruth | None = None,
     done: int = 0,
@@ -53,17 +50,23 @@ def run_exploration(
 ) -> tuple[Belief, Episode, str]:
     """Explore until it is enough, saving as it goes; returns belief, episode and why it ended.
 
-    `save_episode` writes all rows so far, before they are learnt from. `done` steps of an
-    earlier run in the folder are kept, and `steps` come after them.
+    `done` steps of an earlier run in the folder, with the rows `episode`, are kept, and `steps`
+    come after them; where they are all that was asked for, only what ends a run is missing.
     """
     with EstimationRun(folder, prior_name, stopping.steps, done, show_progress) as run:
+        if episode is not None and done >= stopping.steps:
+            return run.finish(episode, truth), episode, f"all {stopping.steps} moves are made"
         for step in steps:
-            save_episode(step.episode)
-            choice = step.choice
+            choice, episode = step.choice, step.episode
+            if not step.settled:
+                run.bar.write(
+                    f"warning: the arm did not stand still after move {len(episode) - 1}",
+                    file=sys.stderr,
+                )
             x, z, angle = choice.command.tolist()
             lead = f"u ({1e3 * x:.0f}, {1e3 * z:.0f} mm, {1e3 * angle:.0f} mrad), "
             if choice.gain is not None:
-                lead += f"gain {choice.gain:.1f}, "
+                lead += f"gain {choice.gain:.1f}, chosen in {step.choosing_seconds:.1f} s, "
             further = {
                 "gain": choice.gain,
                 "choosing_seconds": step.choosing_seconds,
@@ -75,4 +78,6 @@ def run_exploration(
             reason = stopping.reason(step, task)
             if reason is not None:
                 return run.finish(step.episode, truth), step.episode, reason
-    raise ValueError("the exploration ended without a step")
+        if episode is None:
+            raise ValueError("no move promises as much as was asked for; ask for less gain")
+        return run.finish(episode, truth), episode, "no move promises as much as was asked for"

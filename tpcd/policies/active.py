@@ -9,7 +9,7 @@ What is searched are goals up to a few steps away, since a wall out of reach tea
 until one is there. A goal n steps away is worth its gain over the square root of n: divided by n
 itself, the wall was put off again and again for what was near. The first step towards the goal is
 what is commanded. Commands that exceed the force limit with more than the
-set probability are never taken.
+set probability are not taken; where all others do, the arm goes to where it is.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.information import belief_outcomes, expected_information_gain, expected_variance
-from tpcd.policies.basic import best_within
+from tpcd.policies.basic import best_within, within
 from tpcd.policies.limits import Limits
 from tpcd.policies.lookahead import second_step_gain
 from tpcd.policies.protocol import Choice, Situation
@@ -104,11 +104,13 @@ class ActivePolicy:
         for _ in range(settings.rounds):
             elite = goals[_ranked(gain, excess, allowed)[: settings.elite]]
             noise = torch.randn(settings.later, 3, generator=generator, dtype=torch.float64)
-            fresh = _within(elite.mean(0) + noise * elite.std(0), low, high)
+            fresh = within(elite.mean(0) + noise * elite.std(0), low, high)
             rated = self._rate(predictor, situation, fresh)
             goals = torch.cat((goals, fresh))
             gain, excess = (torch.cat(pair) for pair in zip((gain, excess), rated, strict=True))
         finalists = goals[_ranked(gain, excess, allowed)[: settings.finalists]]
+        # To let go of all force and stay is always possible.
+        finalists = torch.cat((finalists, situation.episode.poses[-1:]))
         predictor = ContactPredictor(situation.belief, settings.final_particles)
         gain, excess = self._rate(predictor, situation, finalists)
         if settings.look_ahead:
@@ -157,7 +159,7 @@ class ActivePolicy:
     def _first_step(self, situation: Situation, goals: Tensor) -> tuple[Tensor, Tensor]:
         """The command towards each goal, and how many steps the goal is away."""
         low, high = self._reach(situation, 1.0)
-        here = _within(situation.episode.poses[-1], low, high)
+        here = within(situation.episode.poses[-1], low, high)
         offset = goals - here
         room = torch.where(offset > 0, high - here, here - low).clamp_min(1e-9)
         away = (offset.abs() / room).amax(-1).clamp_min(1.0)
@@ -187,10 +189,6 @@ class ActivePolicy:
         now = (weights * (values - (weights * values).sum(0)).square()).sum(0).mean()
         fall = now - expected_variance(outcomes, values, torch.ones_like(values[0]))
         return fall / away**self._settings.stride_cost, excess
-
-
-def _within(commands: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    return torch.minimum(torch.maximum(commands, low), high)
 
 
 def _ranked(gain: Tensor, excess: Tensor, probability: float) -> Tensor:

@@ -17,10 +17,14 @@ from tpcd.truth.motions import History, Motion
 
 
 class MotionPolicy:
-    """A scripted motion, whatever the belief; `make` starts it from its beginning."""
+    """A scripted motion, whatever the belief; `make` starts it from its beginning.
 
-    def __init__(self, make: Callable[[], Motion]) -> None:
+    With `limits` its commands are drawn back into their box.
+    """
+
+    def __init__(self, make: Callable[[], Motion], limits: Limits | None = None) -> None:
         self._make = make
+        self._limits = limits
         self._motion: Motion | None = None
         self._asked = 0
 
@@ -44,7 +48,9 @@ class MotionPolicy:
                 )
             )
         self._asked = rows
-        return command
+        if self._limits is None:
+            return command
+        return within(command, *self._limits.box(episode.poses[-1], episode.stiffness))
 
 
 class GridPolicy:
@@ -58,11 +64,11 @@ class GridPolicy:
         self._settings = settings or GridSettings()
 
     def choose(self, situation: Situation, generator: torch.Generator) -> Choice:
-        """The best of the grid that keeps within the force limit, or the gentlest of it."""
+        """The best of the grid, or staying here, that keeps within the force limit."""
         episode, belief = situation.episode, situation.belief
         commands = grid_commands(self._basic.next_command(episode), self._settings)
-        low, high = self._limits.box(episode.poses[-1], episode.stiffness)
-        commands = torch.minimum(torch.maximum(commands, low), high)
+        commands = torch.cat((commands, episode.poses[-1:]))
+        commands = within(commands, *self._limits.box(episode.poses[-1], episode.stiffness))
         count = max(1, round(self._settings.share * len(belief.weights)))
         prediction = ContactPredictor(belief, count).predict(
             episode.poses[-1].expand_as(commands),
@@ -72,7 +78,12 @@ class GridPolicy:
         gain = grid_gain(prediction, self._settings)
         excess = self._limits.excess_probability(prediction)
         best = best_within(gain, excess, self._limits.probability)
-        return Choice(commands[best], float(gain[best]), len(commands), float(excess[best]))
+        return Choice(commands[best], float(gain[best]), len(commands) - 1, float(excess[best]))
+
+
+def within(commands: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Commands drawn back into a box."""
+    return torch.minimum(torch.maximum(commands, low), high)
 
 
 def best_within(value: Tensor, excess: Tensor, probability: float) -> int:

@@ -39,15 +39,15 @@ class Limits:
     def box(
         self, pose: Float[Tensor, " 3"], stiffness: Float[Tensor, " 3"], strides: float = 1.0
     ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        """Lowest and highest command from a pose: within step, workspace, and what an arm that
-        were blocked on the spot would bear; or what so many steps (`strides`) reach."""
+        """Lowest and highest command from a pose: within the workspace, and no farther than a
+        step and than what an arm that were blocked on the spot would bear; or than so many of
+        both (`strides`). From outside of the workspace, the way back is made in such steps."""
         step = torch.tensor(self.step, dtype=torch.float64)
         step[:2] = torch.minimum(step[:2], self.force / stiffness[:2].double())
-        step = strides * step
+        nearest, farthest = pose.double() - strides * step, pose.double() + strides * step
         low, high = (torch.tensor(v, dtype=torch.float64) for v in (self.low, self.high))
-        # From outside of the workspace, the way leads back into it.
-        inside = torch.minimum(torch.maximum(pose.double(), low), high)
-        return torch.maximum(inside - step, low), torch.minimum(inside + step, high)
+        clamp = [torch.minimum(torch.maximum(v, nearest), farthest) for v in (low, high)]
+        return clamp[0], clamp[1]
 
     def excess_probability(self, prediction: Prediction) -> Float[Tensor, " n"]:
         """Probability that each predicted transition ends with more than the force limit, at

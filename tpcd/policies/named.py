@@ -27,7 +27,7 @@ def make_policy(
     if name == "grid":
         return GridPolicy(MotionPolicy(lambda: press_and_slide(None)), limits)
     if name == "random":
-        return MotionPolicy(lambda: press_and_slide(stream(seed, _MOTION_STREAM)))
+        return MotionPolicy(lambda: press_and_slide(stream(seed, _MOTION_STREAM)), limits)
     if name == "expert":
-        return MotionPolicy(lambda: expert_motion(scene.wall_position))
-    return MotionPolicy(lambda: rich_exploration(stream(seed, _MOTION_STREAM)))
+        return MotionPolicy(lambda: expert_motion(scene.wall_position), limits)
+    return MotionPolicy(lambda: rich_exploration(stream(seed, _MOTION_STREAM)), limits)

@@ -13,6 +13,8 @@ from tpcd.truth.protocol import Truth
 from tpcd.truth.recording import DEFAULT_SENSOR_STD, Recording
 from tpcd.truth.scene import Scene
 
+_NOISE_STREAM = 4
+
 
 class SimulatedRobot:
     """A truth with independent normal noise on every reading; row k has a noise of its own, so
@@ -90,6 +92,6 @@ class SimulatedRobot:
         return Recording(measured=episode, true=self._true, settled=tuple(self._settled))
 
     def _read(self, row: int, pose: Tensor, wrench: Tensor, settled: bool) -> Reading:
-        generator = stream(self._seed, row)
+        generator = stream(self._seed, _NOISE_STREAM, row)
         noise = self._sensor_std * torch.randn(6, generator=generator, dtype=torch.float64)
         return Reading(pose.double() + noise[:3], wrench.double() + noise[3:], settled)

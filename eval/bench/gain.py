@@ -4,9 +4,10 @@ python -m eval.bench.gain --out runs/bench_gain
 
 The paper's Algorithm 2 weighs 27 commands with a fifth of the filter's particles; it is timed
 with that and with all of them, over the number of particles and the number of commands, beside
-a choice of our own policy. The ranking is tested on beliefs met while exploring: commands
-spread over what is within reach are ranked by the estimator and by a reference with all
-particles and many draws of the noise. Regret is the gain lost by taking the estimator's best.
+a choice of our own policy. The ranking is tested on beliefs met while exploring, the prior
+included: goals near and far are ranked by the estimator with few particles, and by a reference
+with all of them and many draws of the noise. Regret is the gain that taking the estimator's best
+loses.
 """
 
 from __future__ import annotations
@@ -43,10 +44,12 @@ class Benchmark:
     commands: tuple[int, ...] = (27, 54, 108, 216)
     """Numbers of commands of the curve."""
     scenes: int = 6
-    """Scenes in which rankings are compared, after 1, 4 and 8 moves each."""
+    """Scenes in which rankings are compared, after 0, 1, 4 and 8 moves each."""
     candidates: int = 64
     """Commands that are ranked."""
-    reference_draws: int = 24
+    reference_particles: int = 1000
+    """Particles of the beliefs, all of which the reference uses."""
+    reference_draws: int = 8
     """Draws of the noise for each particle in the reference."""
     repeats: int = 3
     """Each part is run this often; the fastest run counts."""
@@ -60,7 +63,8 @@ class Benchmark:
     """Replace an earlier run in the folder."""
 
     def __post_init__(self) -> None:
-        names = ("particles", "commands", "scenes", "candidates", "reference_draws", "repeats")
+        names = ("particles", "commands", "scenes", "candidates", "repeats")
+        names = (*names, "reference_particles", "reference_draws")
         check_numbers(self, least=dict.fromkeys((*names, "threads"), 1))
 
 
@@ -143,6 +147,7 @@ def _ranks(config: Benchmark) -> list[dict[str, Any]]:
     import torch
     from scipy.stats import spearmanr
 
+    from tpcd.belief import EstimatorSettings, SamplerSettings
     from tpcd.exploration import Estimator
     from tpcd.information import belief_outcomes, expected_information_gain
     from tpcd.policies import Limits
@@ -150,16 +155,22 @@ def _ranks(config: Benchmark) -> list[dict[str, Any]]:
     from tpcd.random import stream
     from tpcd.shape.checkpoint import load_prior
 
-    estimator = Estimator(load_prior(config.prior))
+    sampler = SamplerSettings(particles=config.reference_particles)
+    estimator = Estimator(load_prior(config.prior), settings=EstimatorSettings(sampler=sampler))
     found: dict[int, list[tuple[float, float]]] = {}
     for scene in range(1 if config.quick else config.scenes):
-        for situation in _situations(config, estimator, scene, moves=(1, 4, 8)):
+        for situation in _situations(config, estimator, scene, moves=(0, 1, 4, 8)):
             episode = situation.episode
-            low, high = Limits().box(episode.poses[-1], episode.stiffness)
             place = torch.rand(
                 config.candidates, 3, generator=stream(config.seed, scene, 9), dtype=torch.float64
             )
-            commands = low + (high - low) * place
+            # Near and far goals in turn, as the policy searches them.
+            near, far = (
+                Limits().box(episode.poses[-1], episode.stiffness, strides)
+                for strides in (1.0, 3.0)
+            )
+            commands = near[0] + (near[1] - near[0]) * place
+            commands[::2] = far[0] + (far[1] - far[0]) * place[::2]
             noise = torch.randn(
                 config.reference_draws, 3, generator=stream(config.seed, scene, 8),
                 dtype=torch.float64,
@@ -173,7 +184,7 @@ def _ranks(config: Benchmark) -> list[dict[str, Any]]:
                 )  # fmt: skip
                 return expected_information_gain(outcomes, noise)
 
-            reference = gain(700, noise)
+            reference = gain(config.reference_particles, noise)
             for particles in (50, 100, 300):
                 value = gain(particles)
                 correlation = float(spearmanr(value.numpy(), reference.numpy())[0])
@@ -207,6 +218,10 @@ def _situations(
     robot = SimulatedRobot(make_truth(scene, "quasistatic"), scene, config.seed)
     policy = make_policy("random", Limits(), scene, config.seed)
     found = []
+    if 0 in moves:
+        start = robot.start()
+        belief = estimator.before(start, stream(config.seed, scene_number, 7))
+        found.append(Situation(start, belief))
     for step in explore(robot, policy, estimator, config.seed):
         if len(step.episode) - 1 in moves:
             found.append(Situation(step.episode, step.estimation.belief))

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
 from tpcd.belief.importance import assimilate, draw_pool
-from tpcd.belief.pool import cut_off, truncate
+from tpcd.belief.pool import Proposal, cut_off, truncate, weigh
+from tpcd.belief.proposals import DAMPINGS, curved_mixture
 
 SETTINGS = SamplerSettings(particles=2000, draws=6000)
 FEW = SamplerSettings(particles=500, places=20, fresh_modes=20, modes=5)
@@ -181,6 +182,29 @@ def test_few_heavy_draws_are_made_equal_but_a_single_one_is_kept() -> None:
     alone = torch.full((10_000,), 1e-12, dtype=torch.float64)
     alone[7] = 1.0
     assert float(truncate(alone)[7]) > 0.999
+
+
+def test_a_trial_draw_beyond_all_others_does_not_rule_all_draws_out() -> None:
+    model = LinearModel(2)
+    target = model.target(2)
+
+    def strict(x: Tensor, least: Tensor | None) -> Tensor:
+        value = target.likelihood(x)
+        return value if least is None else torch.where(value < least, -torch.inf, value)
+
+    class Strict(type(target)):
+        def log_likelihood(self, positions: Tensor, least: Tensor | None) -> Tensor:
+            return strict(positions, least)
+
+    generator = torch.Generator().manual_seed(0)
+    mixture = curved_mixture(
+        torch.zeros(1, DIMENSION, dtype=torch.float64),
+        *target.curvature(torch.zeros(1, DIMENSION, dtype=torch.float64)),
+        torch.ones(len(DAMPINGS), dtype=torch.float64),
+    )
+    judge = Strict(**vars(target))
+    *_, log_weights = weigh(judge, Proposal(mixture, 1), 200, 1e6, generator)
+    assert torch.isfinite(log_weights).sum() > 100
 
 
 def test_weights_that_are_cut_off_sum_to_one_and_none_dominates() -> None:

@@ -18,6 +18,7 @@ PYTHONPATH=. fabric run --accelerator cpu --devices 4 --num-nodes 2 --node-rank 
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -175,18 +176,26 @@ def _run_missing(config: Table, folder: Path, rank: int, world: int) -> None:
     ):
         for cell in tqdm(todo, unit="cell", disable=rank > 0):
             prior = config.paper_prior if cell.estimator == "paper" else config.prior
-            outcome = run_cell(cell, outlines[cell.object].vertices, prior, steps, tests, length)
+            try:
+                outcome = run_cell(
+                    cell, outlines[cell.object].vertices, prior, steps, tests, length
+                )
+            except ValueError as error:  # one cell must not cost the others
+                write_line(lines, {**vars(cell), "failed": str(error)})
+                continue
             write_line(lines, outcome.row)
             if cell.seed == config.seeds[0] and cell.policy in ("active", "grid"):
                 draw_cell(outcome, cell, folder / "figures", writer)
 
 
 def read_cells(folder: Path) -> list[dict[str, Any]]:
-    """Finished cells of all processes; a line cut off when a run was stopped is left out."""
+    """Finished cells of all processes; failed ones, and a line that was cut off when a run was
+    stopped, are left out and tried again when it goes on."""
     cells = {}
     for path in sorted(folder.glob("cells-*.jsonl")):
         for row in read_lines(path):
-            cells[tuple(row[name] for name in KEY)] = row
+            if "failed" not in row:
+                cells[tuple(row[name] for name in KEY)] = row
     return list(cells.values())
 
 
@@ -199,6 +208,9 @@ def _report(config: Table, folder: Path) -> None:
 
     keys = {cell.key for cell in plan(config)}
     cells = [row for row in read_cells(folder) if tuple(row[name] for name in KEY) in keys]
+    failed = sorted(keys - {tuple(row[name] for name in KEY) for row in cells})
+    if not cells:
+        raise ValueError(f"all {len(failed)} cells failed; see the lines of {folder}/cells-*.jsonl")
     table = summarise(cells)
     pairs = [
         line
@@ -212,7 +224,9 @@ def _report(config: Table, folder: Path) -> None:
         writer.add_text("table", f"```\n{text}\n\n{paired}\n```\n\n{PAPER_NOTE}")
         draw_summary(cells, folder / "figures", writer)
     write_results(folder, table, seeds=config.seeds, comparisons=pairs, note=PAPER_NOTE,
-                  cells=len(cells))  # fmt: skip
+                  cells=len(cells), failed=failed)  # fmt: skip
+    for cell in failed:
+        print(f"failed: {', '.join(map(str, cell))}", file=sys.stderr)
     print(f"results in {folder}")
 
 

@@ -37,6 +37,8 @@ from tpcd.belief.resampling import effective_sample_size, systematic_resample
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
+_TRUSTED = 5
+"""So many trial draws must have a weight before it decides which draws are hopeless."""
 _FEWEST_PLACES = 300.0
 """Places are chosen as if no draw had more than this share of the weight (1 / count), so that
 components also go where the draws found little so far."""
@@ -113,7 +115,8 @@ def draw_pool(
     evaluations += len(trial.positions)
     assert trial.mixture is not None
     proposal = Proposal(trial.mixture, trial.from_prior)
-    best = float(trial.log_weights.max())
+    # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
+    best = float(trial.log_weights.topk(min(_TRUSTED, len(trial.positions))).values[-1])
     for left in reversed(range(settings.attempts)):
         drawn = weigh(target, proposal, settings.draws, best, generator)
         positions, *_, log_weights = drawn

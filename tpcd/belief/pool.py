@@ -88,6 +88,9 @@ def weigh(
     log_prior = target.log_prior(positions)
     density = proposal.log_density(positions, log_prior)
     log_likelihood = target.log_likelihood(positions, threshold(best, density, log_prior))
+    if not bool((log_likelihood > -torch.inf).any()):
+        # A single trial draw of a weight beyond all others must not rule all draws out.
+        log_likelihood = target.log_likelihood(positions, None)
     return positions, log_likelihood, finite(log_prior + log_likelihood - density)
 
 

@@ -109,7 +109,6 @@ class Simulation:
 
 def simulate(config: Simulation) -> None:
     """Simulate episodes of an object in the hand that touches a floor and a wall."""
-    import numpy as np
     import torch
 
     from tpcd.data.episode import write_together
@@ -148,9 +147,7 @@ def simulate(config: Simulation) -> None:
     made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
     contents, lines = {}, []
     for episode, stem in enumerate(config.out / name for name in names):
-        generator = stream(
-            config.seed, EPISODE_STREAM, episode, *np.frombuffer(config.policy.encode(), np.uint8)
-        )
+        generator = stream(config.seed, EPISODE_STREAM, episode, *config.policy.encode())
         motion = make_motion(config.policy, scene, config.steps, generator)
         recording = record(truth, scene, motion, config.steps, generator, sensor_std, notes=notes)
         contents.update(recording_contents(recording, scene, stem, config.format, made_by))

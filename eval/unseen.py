@@ -45,8 +45,6 @@ UNSEEN = (
     "077_rubiks_cube",
 )
 QUICK = ("006_mustard_bottle", "014_lemon")
-LEAST_LOAD = 1e-3
-"""Wrench from which a row counts as contact [N, N·m]."""
 TARGETS = {"x_mm": 0.8, "z_mm": 0.8, "F_x_N": 0.08, "F_z_N": 0.08, "tau_Nm": 0.06}
 
 
@@ -153,8 +151,8 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
 
     import torch
 
+    from eval.scoring import score_tests
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
-    from tpcd.commands.prediction import measured_rows, one_step, prediction_error
     from tpcd.predict import CHANNELS, ContactPredictor
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record
@@ -184,16 +182,8 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
         steps = list(estimate(exploration.measured, shape, sampler, settings))
     seconds = (time.perf_counter() - started) / config.steps
     belief = steps[-1].belief
-    predictor = ContactPredictor(belief)
-    errors, transforms = [], []
-    for test in tests:
-        predicted, rows = one_step(predictor, test.measured, "true"), measured_rows(test.true)[1:]
-        errors.append(prediction_error(rows, predicted.mean))
-        transforms.append(predicted.probability_below(rows))
-    error, transform = torch.cat(errors).abs(), torch.cat(transforms)
+    error, transform, touching = score_tests(ContactPredictor(belief), tests)
     inside = ((transform > 0.05) & (transform < 0.95)).double()
-    # In free motion the arm reaches its command: those rows are certain, and flatter coverage.
-    touching = torch.cat([test.true.wrenches[1:].abs().amax(-1) > LEAST_LOAD for test in tests])
     truth_vector = torch.tensor(list(scene.theta.values()), dtype=torch.float64)
     z = belief.prior.shape.latent_dim
     score = (belief.mean()[z:] - truth_vector) / belief.std()[z:]

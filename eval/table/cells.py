@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eval.scoring import score_tests
 from tpcd.belief.belief import Belief, EstimationStep
-from tpcd.commands.prediction import measured_rows, one_step, prediction_error
 from tpcd.exploration import Estimator, explore
 from tpcd.policies import Limits, make_policy
 from tpcd.predict import ContactPredictor
@@ -31,8 +31,6 @@ from tpcd.truth.scene import Scene, draw_scene, make_truth
 
 CHECKPOINTS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30)
 """Numbers of moves after which the predictions are tested."""
-LEAST_LOAD = 1e-3
-"""Wrench from which a row counts as contact [N, N·m]."""
 TOP = 100
 """Particles of the largest weights that the paper's predictions are the mean of."""
 _SCENE, _TEST, _FIT = 0, 1, 2
@@ -116,16 +114,7 @@ def top_particles(belief: Belief, count: int) -> Belief:
 
 def _test(belief: Belief, recordings: tuple[Recording, ...]) -> dict[str, Any]:
     """Errors and coverage against the noise-free truth, from noisy measured poses."""
-    predictor = ContactPredictor(belief)
-    errors, transforms = [], []
-    for test in recordings:
-        predicted, rows = one_step(predictor, test.measured, "true"), measured_rows(test.true)[1:]
-        errors.append(prediction_error(rows, predicted.mean))
-        transforms.append(predicted.probability_below(rows))
-    error, transform = torch.cat(errors).abs(), torch.cat(transforms)
-    touching = torch.cat(
-        [test.true.wrenches[1:].abs().amax(-1) > LEAST_LOAD for test in recordings]
-    )
+    error, transform, touching = score_tests(ContactPredictor(belief), recordings)
     return {
         "mae": error.mean(0).tolist(),
         "sd": error.std(0, correction=0).tolist(),

@@ -53,11 +53,6 @@ class SamplerSettings:
     """Rounds of importance sampling that shape the mixture."""
     draws: int = 3000
     """Draws from the mixture that the rounds arrived at, which are weighted."""
-    wanted: float = 10.0
-    """Effective sample size of those draws below which they shape the mixture once more, and all
-    is drawn anew."""
-    attempts: int = 2
-    """How often they are drawn at most."""
     prior_draws: int = 1500
     """Draws from the prior at the first datum, falling as 1 / k with datum k."""
     modes: int = 20
@@ -77,8 +72,6 @@ class SamplerSettings:
             "draws_per_place": 1,
             "rounds": 1,
             "draws": 100,
-            "wanted": 0,
-            "attempts": 1,
             "prior_draws": 1,
             "modes": 1,
             "fresh_modes": 1,

@@ -7,8 +7,7 @@ the prior, which takes part with draws of its own (AMIS: Cornuet et al. 2012).
 
 A trial draw that became the centre of a component has made its own density large, and its
 weight too small. So the trial only shapes the mixture: what counts are new draws from it
-(Marin, Pudlo and Sedki 2019), whose mean weight estimates the evidence. Where too few of them
-count, they shape the mixture once more and all is drawn anew.
+(Marin, Pudlo and Sedki 2019), whose mean weight estimates the evidence.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from tpcd.belief.pool import (
     weigh,
 )
 from tpcd.belief.proposals import CurvedMixture, curved_mixture
-from tpcd.belief.resampling import effective_sample_size, systematic_resample
+from tpcd.belief.resampling import systematic_resample
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
@@ -117,18 +116,8 @@ def draw_pool(
     proposal = Proposal(trial.mixture, trial.from_prior)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
     best = float(trial.log_weights.topk(min(_TRUSTED, len(trial.positions))).values[-1])
-    for left in reversed(range(settings.attempts)):
-        drawn = weigh(target, proposal, settings.draws, best, generator)
-        positions, *_, log_weights = drawn
-        evaluations += len(positions)
-        if left == 0 or effective_sample_size(known_weights(log_weights)) >= settings.wanted:
-            break
-        # What the draws found shapes the mixture, from which all is drawn anew.
-        centres = positions[_spread_choice(log_weights, settings.places, generator)]
-        counts = _counts(shares, settings.draws_per_place)
-        fresh = curved_mixture(centres, *target.curvature(centres), counts)
-        proposal = Proposal(CurvedMixture.joined([proposal.mixture, fresh]), trial.from_prior)
-        evaluations += CURVATURE_COST * len(centres)
+    drawn = weigh(target, proposal, settings.draws, best, generator)
+    evaluations += settings.draws
     return Pool(*drawn, peaks.points, shares, evaluations)
 
 

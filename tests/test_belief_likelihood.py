@@ -11,15 +11,12 @@ from torch import Tensor
 
 from tpcd.belief.belief import EstimatorSettings, estimate
 from tpcd.belief.cloud import SamplerSettings
-from tpcd.belief.history import PARITY_LIMIT, History, history_of, parity_chi_square
-from tpcd.belief.likelihood import (
-    HistoryLikelihood,
-    _filter,
-    highest_terms,
-    history_likelihood,
-)
+from tpcd.belief.filtered import HistoryLikelihood, filter_history
+from tpcd.belief.history import History, history_of, parity_chi_square
+from tpcd.belief.likelihood import highest_terms, history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
+from tpcd.belief.setting import PARITY_LIMIT
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
@@ -98,7 +95,8 @@ def test_the_last_transition_changes_nothing_of_what_came_before(
     assert (whole.total <= shorter.total + last + 1e-9).all()
     scene = scene_from_parameters(shape, Parameters.from_vector(particles))
     sds = torch.full((len(particles),), sd, dtype=torch.float64)
-    each = _filter(scene, sds, history, field, StepSettings(), innovations=True)
+    setting = history.setting(scene)
+    each = filter_history(scene.points_ee, setting, sds, field, StepSettings(), innovations=True)
     terms = -(0.5 * each.whitened**2 + each.log_scale + 0.5 * math.log(2 * math.pi)).sum(-1)
     known = torch.isfinite(shorter.total)
     assert known.any()
@@ -115,8 +113,10 @@ def test_compiled_loops_and_torch_agree(
     found = evaluate(shape, particles, history)
     scene = scene_from_parameters(shape, Parameters.from_vector(particles))
     sd = torch.full((len(particles),), FIELD.sd, dtype=torch.float64)
-    expected = _filter(scene, sd, history, FIELD, StepSettings())
-    for name, value in vars(expected).items():
+    setting = history.setting(scene)
+    expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
+    for name in ("total", "field_mean", "field_covariance"):
+        value = getattr(expected, name)
         scale = FIELD.sd ** ("field_mean", "field_covariance").index(name) if "field" in name else 1
         torch.testing.assert_close(getattr(found, name), value, rtol=1e-8, atol=1e-8 * scale)
 
@@ -181,7 +181,8 @@ def test_a_jammed_particle_is_answered_like_the_torch_path(
     first = simulate_step(scene, start, command, history.stiffness, previous=previous)
     assert (first.status == int(StepStatus.RELAXED)).any()
     sd = torch.full((len(jammed),), FIELD.sd, dtype=torch.float64)
-    expected = _filter(scene, sd, history, FIELD, StepSettings())
+    setting = history.setting(scene)
+    expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
     found = evaluate(shape, jammed, history)
     torch.testing.assert_close(found.total, expected.total, rtol=1e-8, atol=1e-8)
 

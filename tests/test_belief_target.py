@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.history import History, history_of
+from tpcd.belief.history import history_of
 from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.belief.setting import Merged
 from tpcd.belief.target import ContactTarget
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
@@ -57,11 +60,13 @@ def test_settled_poses_move_with_theta_as_automatic_derivatives_say(
     compared = 0
     for k in range(STEPS):
         unit = 1e4
-        one = History(
-            history.poses[k : k + 2],
-            torch.full((2, 3), unit**2, dtype=torch.float64) * torch.tensor([[1e-20], [1.0]]),
-            history.commands[k : k + 2],
-            history.stiffness,
+        known = torch.tensor([[1e-20], [1.0]], dtype=torch.float64).expand(2, 3)
+        merged = {name: value[:, k : k + 2] for name, value in vars(history.merged).items()}
+        one = replace(
+            history.first(1),
+            commands=history.commands[k : k + 2],
+            readings=history.readings[k : k + 2],
+            merged=Merged(**{**merged, "variance": unit**2 * known[None]}),
         )
         found = linearised_likelihood(
             prior.shape, vectors, slopes, torch.zeros(8).double(), one, MisfitField(0.0), settings

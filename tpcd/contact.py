@@ -26,10 +26,10 @@ class ContactScene:
 
     `points_ee` are outline points in the end-effector frame [m], `terrains` the t bodies of
     the world, `friction` the Coulomb coefficient of the object against each of them. All
-    carry the same leading batch axes.
+    carry the same leading batch axes, but those of the outlines may be of length 1.
     """
 
-    points_ee: Float[Tensor, "*batch p 2"]
+    points_ee: Float[Tensor, "*#batch p 2"]
     terrains: tuple[Terrain, ...]
     friction: Float[Tensor, "*batch t"]
 
@@ -49,11 +49,24 @@ class ContactScene:
     def gather(self, index: Int[Tensor, "*batch"]) -> ContactScene:
         """The scenes at positions `index` of the flattened batch."""
         points = self.points_ee
+        points = points.expand(*self.batch_shape, *points.shape[-2:])
         return ContactScene(
             points_ee=points.reshape(-1, *points.shape[-2:]).index_select(0, index),
             terrains=tuple(body.gather(index) for body in self.terrains),
             friction=self.friction.reshape(-1, self.friction.shape[-1])[index],
         )
+
+    def columns(self, index: Int[Tensor, " n"]) -> ContactScene:
+        """The scenes at positions `index` of the last batch axis, where it has more than one."""
+
+        def pick(value: Tensor, axis: int) -> Tensor:
+            return value if value.shape[axis] == 1 else value.index_select(axis, index)
+
+        planes = []
+        for body in self.terrains:
+            assert isinstance(body, HalfPlane)
+            planes.append(HalfPlane(pick(body.direction, -2), pick(body.offset, -1)))
+        return ContactScene(pick(self.points_ee, -3), tuple(planes), pick(self.friction, -2))
 
 
 @dataclass(frozen=True)

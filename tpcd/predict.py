@@ -19,7 +19,6 @@ from tpcd.belief.belief import Belief
 from tpcd.belief.misfit import misfit_rows
 from tpcd.belief.resampling import systematic_resample
 from tpcd.contact import ContactScene, column_scene, scene_from_parameters
-from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.simulator import StepStatus, simulate_step
 
@@ -145,7 +144,7 @@ class ContactPredictor:
         else:
             keep = torch.arange(len(belief.weights))
             self.weights = belief.weights
-        parameters = Parameters.from_vector(belief.vectors[keep])
+        parameters = belief.prior.parameters_of(belief.vectors[keep])
         with torch.no_grad():
             scene = scene_from_parameters(belief.prior.shape, parameters)
         self._scene: ContactScene = column_scene(scene)

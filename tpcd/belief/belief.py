@@ -79,7 +79,7 @@ class Belief:
     @property
     def parameters(self) -> Parameters:
         """The particles as named tensors."""
-        return Parameters.from_vector(self.vectors)
+        return self.prior.parameters_of(self.vectors)
 
     def mean(self) -> Float[Tensor, " d"]:
         """Posterior mean of theta."""
@@ -155,7 +155,7 @@ def prior_belief(
     target = ContactTarget(prior, misfit, settings.step)
     score = target.sample(settings.sampler.particles, generator)
     vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
-    scene = scene_from_parameters(shape, Parameters.from_vector(vectors)).double()
+    scene = scene_from_parameters(shape, prior.parameters_of(vectors)).double()
     gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, episode.poses[0].expand(len(sd), 3))
     free = (gaps.amin((-1, -2)) > -2 * sd).double()
     weights = free if bool(free.any()) else torch.ones_like(free)

@@ -57,7 +57,7 @@ class Innovation:
 
 
 def first_state(
-    sd: Float[Tensor, " m"], coefficients: int, variance: Float[Tensor, " 3"]
+    sd: Float[Tensor, " m"], coefficients: int, variance: Float[Tensor, "*each 3"]
 ) -> FieldState:
     """Before any transition: coefficients of standard deviation sd, first pose of `variance`."""
     field = (sd**2)[:, None].expand(-1, coefficients)
@@ -65,19 +65,28 @@ def first_state(
     return FieldState(torch.zeros_like(diagonal), torch.diag_embed(diagonal))
 
 
+def parted(state: FieldState, count: int, variance: Float[Tensor, "*each 3"]) -> FieldState:
+    """The state past a transition that does not count: of the pose only its reading is known."""
+    mean, covariance = state.mean.clone(), torch.zeros_like(state.covariance)
+    mean[:, count:] = 0.0
+    covariance[:, :count, :count] = state.covariance[:, :count, :count]
+    covariance[:, count:, count:] = torch.diag_embed(variance)
+    return FieldState(mean, covariance)
+
+
 def assimilate(
     state: FieldState,
     residual: Float[Tensor, "m 3"],
     rows: Float[Tensor, "m 3 c"],
     from_start: Float[Tensor, "m 3 3"],
-    variance: Float[Tensor, " 3"],
+    variance: Float[Tensor, "*each 3"],
     uncovered: Float[Tensor, "m 3 3"],
 ) -> tuple[FieldState, Innovation]:
     """The state after a transition that started at the filtered pose, and its innovation."""
     count = rows.shape[-1]
     design = torch.cat((rows, -from_start), dim=-1)
     cross = state.covariance @ design.mT
-    noise = torch.diag(variance)
+    noise = torch.diag_embed(variance)
     covariance = design @ cross + noise + uncovered
     innovation = residual - (rows @ state.mean[:, :count, None])[..., 0]
     factor, whitened = _whiten(covariance, innovation)

@@ -15,8 +15,17 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from tpcd.simulator.kernel import Answer, Request, prepare, source_stamp, step_element
-from tpcd.simulator.kernel_geometry import new_chains
+from tpcd.simulator.kernel import (
+    Answer,
+    Request,
+    new_planes,
+    own_law,
+    prepare,
+    set_stiffness,
+    source_stamp,
+    step_element,
+)
+from tpcd.simulator.kernel_geometry import World, new_chains
 from tpcd.simulator.kernel_settle import RELAXED, new_space
 from tpcd.simulator.kernel_slopes import new_slopes
 
@@ -24,27 +33,49 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Measured(NamedTuple):
-    """What is known and asked of m particles over n transitions.
+    """What is known and asked of m particles over n transitions between r = n + 1 rows.
 
-    `poses` (n + 1, 3) and their `variance`; values and `slopes` (n, j) of the bumps; `rest`
-    (n) what the terms after each one can still add; `least` (m) what must be reached; `sd` (m) of
-    the misfit; `limit` of an innovation's square.
+    `poses` (c, r, 3) and their `variance`, the same for all particles (c = 1) or one for each;
+    `shift` (c, r, 3) is added to what the model predicts. Values and `slopes` (n, j) of the
+    bumps; `rest` (c, n) what the terms after each one can still add; `least` (m) what must be
+    reached; `sd` (m) of the misfit; `limit` of an innovation's square. `used` (n) says which
+    transitions count: the others part the history.
     """
 
     poses: np.ndarray
     variance: np.ndarray
+    shift: np.ndarray
     bumps: np.ndarray
     slopes: np.ndarray
     rest: np.ndarray
     least: np.ndarray
     sd: np.ndarray
+    used: np.ndarray
     limit: float
+
+
+class Given(NamedTuple):
+    """What the arm is asked and what it meets, for m particles and r rows, or 1 of either.
+
+    `commands` and `stiffness` (.., .., 3); `turns` (.., .., 1) the angle of the object in the
+    hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` (.., .., t).
+    """
+
+    commands: np.ndarray
+    stiffness: np.ndarray
+    turns: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    friction: np.ndarray
+    substeps: int
+    follow_path: bool
 
 
 class Found(NamedTuple):
     """Where the answers go: log likelihood (m), field mean (m, c) and covariance (m, c, c),
     innovations and the logarithms of their units (m, n, 3) where they are asked for (else m = 0),
-    and derivatives (m, d, n, 3) of the innovations by d entries of theta.
+    and derivatives (m, d, n, 3) of the innovations by d entries of theta. `poses` (m, n, 3),
+    `modes` (m, n, t) and `contacts` (m, n, t, 4) of the settled steps where they are asked for.
     """
 
     total: np.ndarray
@@ -54,6 +85,9 @@ class Found(NamedTuple):
     whitened: np.ndarray
     log_scale: np.ndarray
     slopes: np.ndarray
+    poses: np.ndarray
+    modes: np.ndarray
+    contacts: np.ndarray
 
 
 class Filter(NamedTuple):
@@ -76,19 +110,19 @@ def _compile_explain_range(stamp: int) -> Callable[..., None]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     @no_type_check
-    def explain_range(world, law, request, measured, by_theta, found, first, last):
+    def explain_range(points, law, given, measured, by_theta, found, first, last):
         if stamp >= 0:
-            _explain_range(world, law, request, measured, by_theta, found, first, last)
+            _explain_range(points, law, given, measured, by_theta, found, first, last)
 
     return explain_range
 
 
 @njit(nogil=True, error_model="numpy")
 @no_type_check
-def _explain_range(world, law, request, measured, by_theta, found, first, last):
-    """Evaluate the particles from `first` up to `last`."""
-    terrains, count = world.normals.shape[1], world.points.shape[2]
-    steps, size = measured.rest.shape[0], found.mean.shape[1]
+def _explain_range(points, law, given, measured, by_theta, found, first, last):
+    """Evaluate the particles from `first` up to `last`; `points` (m, 2, p) are their outlines."""
+    terrains, count = given.offsets.shape[2], points.shape[2]
+    steps, size = measured.used.shape[0], found.mean.shape[1]
     entries = by_theta.offsets.shape[1]
     chains, space = new_chains(terrains, count), new_space(terrains)
     slopes = new_slopes(terrains, entries)
@@ -101,6 +135,7 @@ def _explain_range(world, law, request, measured, by_theta, found, first, last):
         np.zeros((steps, 3, 3)),
         np.zeros((steps, terrains, 3)),
         np.zeros((steps, terrains, 3)),
+        np.zeros((steps, terrains, 4)),
     )
     state = Filter(
         np.zeros(size + 3),
@@ -112,39 +147,70 @@ def _explain_range(world, law, request, measured, by_theta, found, first, last):
         np.zeros((entries, size + 3)),
     )
     # Each particle starts its transitions at poses of its own.
-    starts = request.starts.copy()
+    starts, previous, commands = (
+        np.zeros((steps, 3)), np.zeros((steps, 3)), np.zeros((steps, 3))
+    )  # fmt: skip
     request = Request(
-        request.owner,
+        np.zeros(1, np.int64),
+        np.zeros(1, np.int64),
+        np.ones((1, 3)),
         starts,
-        request.previous,
-        request.commands,
-        request.rested,
-        request.substeps,
-        request.follow_path,
+        previous,
+        commands,
+        False,
+        given.substeps,
+        given.follow_path,
     )
+    normals, offsets, friction = new_planes(terrains)
+    law = own_law(law)
     for i in range(first, last):
         found.total[i] = -np.inf
         if not math.isfinite(measured.sd[i]) or not measured.least[i] < np.inf:
             continue
-        extent = prepare(world, i, law, request, 0, steps, chains)
-        _begin(state, measured, measured.sd[i])
+        seen = i if measured.poses.shape[0] > 1 else 0
+        asked = i if given.commands.shape[0] > 1 else 0
+        turned = i if given.turns.shape[0] > 1 else 0
+        firm = i if given.stiffness.shape[0] > 1 else 0
+        for k in range(steps):
+            begins, ends = _turns(given, turned, k)
+            for a in range(3):
+                starts[k, a] = measured.poses[seen, k, a]
+                previous[k, a] = given.commands[asked, k, a]
+                commands[k, a] = given.commands[asked, k + 1, a]
+            starts[k, 2] += begins
+            previous[k, 2] += begins
+            commands[k, 2] += ends
+        here = World(points[i : i + 1], normals, offsets, friction)
+        _meet(here, given, i, 0)
+        extent = prepare(here, 0, law, request, 0, steps, chains)
+        _begin(state, measured, seen, measured.sd[i])
         total = 0.0
         for k in range(steps):
+            if not measured.used[k]:
+                _part(state, measured, seen, k, size)
+                continue
+            _meet(here, given, i, k + 1)
+            set_stiffness(law, given.stiffness[firm, k + 1 if given.stiffness.shape[1] > 1 else 0])
+            begins, ends = _turns(given, turned, k)
             for a in range(3):
-                starts[k, a] = measured.poses[k, a] - state.mean[size + a]
+                starts[k, a] = measured.poses[seen, k, a] - state.mean[size + a]
+            starts[k, 2] += begins
             step_element(
-                world, i, chains, law, extent, request, k, answer, space, slopes, poses, by_theta
+                here, 0, chains, law, extent, request, k, answer, space, slopes, poses, by_theta, i
             )
+            answer.poses[k, 2] -= ends
             if answer.statuses[k] == RELAXED:
                 found.jammed[i] = True
                 break
-            total += _assimilate(state, measured, answer, k, measured.sd[i])
+            if found.poses.shape[0] > 0:
+                _keep(found, answer, i, k)
+            total += _assimilate(state, measured, answer, seen, k, measured.sd[i])
             if found.whitened.shape[0] > 0 and math.isfinite(total):
                 for a in range(3):
                     found.whitened[i, k, a] = state.innovation[a]
                     found.log_scale[i, k, a] = math.log(state.factor[a, a])
                 _follow(state, slopes.theta, found.slopes, i, k, size)
-            if not (total + measured.rest[k] >= measured.least[i] and math.isfinite(total)):
+            if not (total + measured.rest[seen, k] >= measured.least[i] and math.isfinite(total)):
                 total = -np.inf
                 break
         if found.jammed[i]:
@@ -158,7 +224,54 @@ def _explain_range(world, law, request, measured, by_theta, found, first, last):
 
 @njit(_nrt=False)
 @no_type_check
-def _begin(state, measured, sd):
+def _turns(given, i, k):
+    """The angle of the object in the hand at the start and at the end of transition k."""
+    if given.turns.shape[1] > 1:
+        return given.turns[i, k, 0], given.turns[i, k + 1, 0]
+    return given.turns[i, 0, 0], given.turns[i, 0, 0]
+
+
+@njit(_nrt=False)
+@no_type_check
+def _meet(here, given, i, row):
+    """Take over the planes of a particle at a row."""
+    each, rows = given.offsets.shape[0] > 1, given.offsets.shape[1] > 1
+    p, r = i if each else 0, row if rows else 0
+    for t in range(given.offsets.shape[2]):
+        here.normals[0, t, 0] = given.normals[p, r, t, 0]
+        here.normals[0, t, 1] = given.normals[p, r, t, 1]
+        here.offsets[0, t], here.friction[0, t] = given.offsets[p, r, t], given.friction[p, r, t]
+
+
+@njit(_nrt=False)
+@no_type_check
+def _keep(found, answer, i, k):
+    """Keep how the step of transition k settled."""
+    for a in range(3):
+        found.poses[i, k, a] = answer.poses[k, a]
+    for t in range(answer.modes.shape[1]):
+        found.modes[i, k, t] = answer.modes[k, t]
+        for a in range(4):
+            found.contacts[i, k, t, a] = answer.contacts[k, t, a]
+
+
+@njit(_nrt=False)
+@no_type_check
+def _part(state, measured, seen, k, size):
+    """Pass over transition k: what is known of the next pose is its reading alone."""
+    for a in range(3):
+        state.mean[size + a] = 0.0
+        for r in range(size + 3):
+            state.covariance[size + a, r] = state.covariance[r, size + a] = 0.0
+        state.covariance[size + a, size + a] = measured.variance[seen, k + 1, a]
+    for e in range(state.by_theta.shape[0]):
+        for a in range(3):
+            state.by_theta[e, size + a] = 0.0
+
+
+@njit(_nrt=False)
+@no_type_check
+def _begin(state, measured, seen, sd):
     """The state before any transition."""
     width = state.mean.shape[0]
     state.by_theta[:] = 0.0
@@ -166,12 +279,13 @@ def _begin(state, measured, sd):
         state.mean[a] = 0.0
         for b in range(width):
             state.covariance[a, b] = 0.0
-        state.covariance[a, a] = sd * sd if a < width - 3 else measured.variance[0, a - width + 3]
+        own = a - width + 3
+        state.covariance[a, a] = sd * sd if own < 0 else measured.variance[seen, 0, own]
 
 
 @njit(error_model="numpy", _nrt=False)
 @no_type_check
-def _assimilate(state, measured, answer, k, sd):
+def _assimilate(state, measured, answer, seen, k, sd):
     """Filter the residual of transition k; returns its log density, -inf where it has none."""
     mean, covariance, design = state.mean, state.covariance, state.design
     cross, factor, innovation = state.cross, state.factor, state.innovation
@@ -179,7 +293,9 @@ def _assimilate(state, measured, answer, k, sd):
     size, variance = width - 3, measured.variance
     total = 0.0
     for a in range(3):
-        innovation[a] = measured.poses[k + 1, a] - answer.poses[k, a]
+        innovation[a] = (
+            measured.poses[seen, k + 1, a] - measured.shift[seen, k + 1, a] - answer.poses[k, a]
+        )
         total += innovation[a]
     if answer.statuses[k] > RELAXED or not math.isfinite(total):
         return -np.inf
@@ -199,7 +315,7 @@ def _assimilate(state, measured, answer, k, sd):
         for r in range(size):
             innovation[a] -= design[a, r] * mean[r]
         for b in range(a + 1):
-            value = variance[k + 1, a] if a == b else 0.0
+            value = variance[seen, k + 1, a] if a == b else 0.0
             for t in range(answer.from_gap.shape[1]):
                 value += uncovered * answer.from_gap[k, t, a] * answer.from_gap[k, t, b]
             for r in range(width):
@@ -218,7 +334,7 @@ def _assimilate(state, measured, answer, k, sd):
                 factor[a, b] *= root
         log_determinant += 3.0 * math.log(growth)
         square = measured.limit
-    _advance(state, variance, k, size)
+    _advance(state, variance, seen, k, size)
     return -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
 
 
@@ -240,7 +356,7 @@ def _fill_design(design, measured, answer, k, size):
 
 @njit(_nrt=False)
 @no_type_check
-def _advance(state, variance, k, size):
+def _advance(state, variance, seen, k, size):
     """The state after a transition, from the whitened innovation and the cross covariance.
 
     The field goes on; the error of this pose takes the place of the error of the last one.
@@ -251,8 +367,8 @@ def _advance(state, variance, k, size):
         for r in range(size + 3):
             covariance[size + a, r] = covariance[r, size + a] = 0.0
         for b in range(3):
-            gain[size + a, b] = variance[k + 1, a] if a == b else 0.0
-        covariance[size + a, size + a] = variance[k + 1, a]
+            gain[size + a, b] = variance[seen, k + 1, a] if a == b else 0.0
+        covariance[size + a, size + a] = variance[seen, k + 1, a]
     for r in range(size + 3):
         for a in range(3):
             for b in range(a):
@@ -320,7 +436,7 @@ def _forward(factor, vector):
 
 
 explain_range = _compile_explain_range(source_stamp(sys.modules[__name__]))
-"""Evaluate particles `first` up to `last`: (world, law, request, measured, by_theta, found,
+"""Evaluate particles `first` up to `last`: (points, law, given, measured, by_theta, found,
 first, last).
 
 Fills their part of `found` in place and releases the interpreter lock meanwhile.

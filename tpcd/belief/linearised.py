@@ -7,10 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.belief.compiled import compiled_filter
+from tpcd.belief.filtered import HistoryLikelihood
 from tpcd.belief.history import History
-from tpcd.belief.likelihood import HistoryLikelihood, compiled_likelihood
+from tpcd.belief.likelihood import effective_setting
 from tpcd.belief.misfit import MisfitField
 from tpcd.contact import place_points, scene_from_parameters
+from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings, native
@@ -27,12 +30,14 @@ def linearised_likelihood(
     history: History,
     field: MisfitField,
     settings: StepSettings,
+    added: Added | None = None,
 ) -> HistoryLikelihood:
     """The likelihood with the derivatives of its innovations by d coordinates, in compiled loops.
 
     `vectors` are theta, and `slopes` the derivatives of each entry by its own coordinate. The
     scene moves by differences, the settled poses by the derivatives of the rest equations,
-    and the filter at a fixed gain (Gauss-Newton). NaN where a particle jams.
+    and the filter at a fixed gain (Gauss-Newton). NaN where a particle jams. Effects are taken
+    as they are, as if theta did not change how they act.
     """
     from tpcd.simulator.kernel_slopes import SceneSlopes
 
@@ -55,6 +60,15 @@ def linearised_likelihood(
         parts.append(np.ascontiguousarray((value[1:] - value[0]).swapaxes(0, 1)) / _DIFFERENCE)
     first = Parameters.from_vector(vectors)
     scene = scene_from_parameters(shape, first, place_points(points[0], first.scale, first.mount))
-    return compiled_likelihood(
-        scene, misfit_sd, history, field, settings, None, True, SceneSlopes(*parts)
+    setting = history.setting(scene)
+    if added is not None and added.effects:
+        setting = effective_setting(scene, history, misfit_sd, field, settings, added)
+    return compiled_filter(
+        scene.points_ee,
+        setting,
+        misfit_sd,
+        field,
+        settings,
+        innovations=True,
+        by_theta=SceneSlopes(*parts),
     )

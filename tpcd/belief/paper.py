@@ -47,7 +47,6 @@ from tpcd.belief.resampling import (
 from tpcd.belief.state import EstimatorState
 from tpcd.contact import column_scene, scene_from_parameters
 from tpcd.data.episode import Episode
-from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
@@ -162,7 +161,7 @@ def window_log_likelihood(
     settings: PaperSettings,
 ) -> Float[Tensor, " m"]:
     """Log of the product of exp(-1/2 e^T R^-1 e) over rows first..last; -inf where a step fails."""
-    parameters = Parameters.from_vector(vectors)
+    parameters = prior.parameters_of(vectors)
     scene = column_scene(scene_from_parameters(prior.shape, parameters))
     rows, before = slice(first, last + 1), slice(first - 1, last)
     transition = simulate_step(

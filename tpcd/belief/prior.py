@@ -9,13 +9,14 @@ wall and a uniform prior becomes a standard normal one. The shape latent has the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.effects.protocol import Added, Effect, effect_parameters, parameter_bounds
 from tpcd.parameters import (
     DEFAULT_BOUNDS,
     SCENE_NAMES,
@@ -36,21 +37,49 @@ class ParameterPrior:
     shape: Shape
     low: Float[Tensor, " d"]
     high: Float[Tensor, " d"]
+    effects: tuple[Effect, ...] = ()
+    """Effects that the model has besides; their parameters follow the entries of the scene."""
 
     @property
     def dimension(self) -> int:
-        """Number of entries d of theta."""
+        """Number of entries d of theta, those of the effects included."""
         return len(self.low)
+
+    @property
+    def scene_dimension(self) -> int:
+        """Number of entries of theta without those of the effects."""
+        return self.shape.latent_dim + len(SCENE_NAMES)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of theta."""
-        return parameter_names(self.shape.latent_dim)
+        own = (f"{effect.name}.{p.name}" for effect in self.effects for p in effect.parameters)
+        return (*parameter_names(self.shape.latent_dim), *own)
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the entries of theta."""
-        return parameter_units(self.shape.latent_dim)
+        own = (parameter.unit for parameter in effect_parameters(self.effects))
+        return (*parameter_units(self.shape.latent_dim), *own)
+
+    def with_effects(self, effects: Sequence[Effect]) -> ParameterPrior:
+        """The prior of the same scene with these effects and no others."""
+        scene = self.scene_dimension
+        low, high = parameter_bounds(effects)
+        return replace(
+            self,
+            low=torch.cat((self.low[:scene], low)),
+            high=torch.cat((self.high[:scene], high)),
+            effects=tuple(effects),
+        )
+
+    def parameters_of(self, vector: Float[Tensor, "*batch d"]) -> Parameters:
+        """The scene's entries of theta as named tensors."""
+        return Parameters.from_vector(vector[..., : self.scene_dimension])
+
+    def added_of(self, vector: Float[Tensor, "m d"]) -> Added:
+        """The effects with their values."""
+        return Added(self.effects, vector[..., self.scene_dimension :])
 
     def to_vector(self, score: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         """Theta in SI units from unconstrained coordinates."""
@@ -66,7 +95,7 @@ class ParameterPrior:
 
     def to_parameters(self, score: Float[Tensor, "*batch d"]) -> Parameters:
         """Theta as named tensors from unconstrained coordinates."""
-        return Parameters.from_vector(self.to_vector(score))
+        return self.parameters_of(self.to_vector(score))
 
     def to_score(self, vector: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         """Unconstrained coordinates of theta; entries outside their box land on its edge."""
@@ -112,7 +141,9 @@ class ParameterPrior:
 
 
 def make_prior(
-    shape: Shape, bounds: Mapping[str, tuple[float, float]] | None = None
+    shape: Shape,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    effects: Sequence[Effect] = (),
 ) -> ParameterPrior:
     """The prior with the default bounds, replaced where `bounds` names an entry [SI units].
 
@@ -129,8 +160,9 @@ def make_prior(
             raise ValueError(f"prior of {name} is [{lower}, {upper}], expected low < high")
         low.append(lower)
         high.append(upper)
-    return ParameterPrior(
+    prior = ParameterPrior(
         shape=shape,
         low=torch.tensor(low, dtype=torch.float64),
         high=torch.tensor(high, dtype=torch.float64),
     )
+    return prior.with_effects(effects) if effects else prior

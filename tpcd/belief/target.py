@@ -9,14 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.belief.filtered import HistoryLikelihood
 from tpcd.belief.history import History
-from tpcd.belief.likelihood import (
-    HistoryLikelihood,
-    history_likelihood,
-)
+from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
+from tpcd.belief.setting import PARITY_LIMIT, merge
 from tpcd.simulator import StepSettings, native
 
 _LARGE_MISFIT = 2.0
@@ -97,24 +96,53 @@ class ContactTarget:
             return _Linearised(whitened[0], slopes, stretch)
         assert self.history is not None
         vectors, slope = self.prior.to_vector_with_slope(score[:, :-1])
+        scene, added = self.prior.scene_dimension, self.prior.added_of(vectors)
         here = linearised_likelihood(
             self.prior.shape,
-            vectors,
-            slope,
+            vectors[:, :scene],
+            slope[:, :scene],
             self.misfit.sd_of(score[:, -1]),
             self.history,
             self.misfit,
             self.step,
+            added,
         )
-        moved = score + torch.cat((score.new_zeros(s - 1), score.new_full((1,), _DIFFERENCE)))
-        there = self.evaluate(moved, innovations=True)
-        last, stretch = (
-            (_known(b) - _known(a)) / _DIFFERENCE
-            for a, b in ((here.whitened, there.whitened), (here.log_scale, there.log_scale))
-        )
-        slopes = torch.cat((_known(here.slopes), last[:, None]), dim=1)
-        still = torch.zeros_like(slopes[:, :-1])
-        return _Linearised(_known(here.whitened), slopes, torch.cat((still, stretch[:, None]), 1))
+        parity, parity_scale = self._parity(score)
+        whitened = torch.cat((_known(here.whitened), parity), dim=1)
+        log_scale = torch.cat((_known(here.log_scale), parity_scale), dim=1)
+        slopes, stretch = [_known(here.slopes)], []
+        # Effects and the size of the misfit by differences.
+        for entry in range(scene, s):
+            moved = score.clone()
+            moved[:, entry] += _DIFFERENCE
+            there = self.evaluate(moved, innovations=True)
+            parity, parity_scale = self._parity(moved)
+            found = torch.cat((_known(there.whitened), parity), dim=1)
+            scale = torch.cat((_known(there.log_scale), parity_scale), dim=1)
+            slopes.append(((found - whitened) / _DIFFERENCE)[:, None])
+            stretch.append(((scale - log_scale) / _DIFFERENCE)[:, None])
+        # The scene does not move what pose and wrench say about each other.
+        missing = whitened.shape[1] - slopes[0].shape[2]
+        slopes[0] = torch.nn.functional.pad(slopes[0], (0, 0, 0, missing))
+        still = torch.zeros_like(slopes[0])
+        return _Linearised(whitened, torch.cat(slopes, 1), torch.cat((still, *stretch), 1))
+
+    def _parity(self, score: Tensor) -> tuple[Tensor, Tensor]:
+        """What pose and wrench of each row say about each other, in standard units, and the
+        logarithms of the units; no rows where no effect can change it."""
+        if not self.prior.effects:
+            return score.new_zeros(len(score), 0, 3), score.new_zeros(len(score), 0, 3)
+        assert self.history is not None
+        history = self.history
+        added = self.prior.added_of(self.prior.to_vector(score[:, :-1]))
+        conditions = added.apply(history.bare, history.rows, None)
+        merged = merge(history.readings, history.sensor_variance, conditions)
+        growth = (merged.chi_square / PARITY_LIMIT).clamp_min(1.0).sqrt()
+        scale = merged.scale * growth[..., None]
+        read = history.read[:, None]
+        whitened = torch.where(read, merged.offset / scale, 0.0)
+        units = torch.where(read, scale.log() + merged.log_units[..., None] / 3, 0.0)
+        return tuple(part.expand(len(score), -1, -1) for part in (whitened, units))
 
     def evaluate(
         self,
@@ -124,15 +152,17 @@ class ContactTarget:
     ) -> HistoryLikelihood:
         """What the particles say about the history."""
         assert self.history is not None
+        vectors = self.prior.to_vector(score[:, :-1])
         return history_likelihood(
             self.prior.shape,
-            self.prior.to_parameters(score[:, :-1]),
+            self.prior.parameters_of(vectors),
             self.misfit.sd_of(score[:, -1]),
             self.history,
             self.misfit,
             self.step,
             least,
             innovations,
+            self.prior.added_of(vectors),
         )
 
 

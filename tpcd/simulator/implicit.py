@@ -55,7 +55,7 @@ def newton_pose(
     scene: ContactScene,
     start: Float[Tensor, "b 3"],
     command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, " 3"],
+    stiffness: Float[Tensor, "*each 3"],
     pose: Float[Tensor, "b 3"],
     contacts: ContactSet,
     settings: StepSettings,
@@ -68,7 +68,7 @@ def newton_step(
     scene: ContactScene,
     start: Float[Tensor, "b 3"],
     command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, " 3"],
+    stiffness: Float[Tensor, "*each 3"],
     pose: Float[Tensor, "b 3"],
     contacts: ContactSet,
     settings: StepSettings,
@@ -83,7 +83,7 @@ def linear_response(
     scene: ContactScene,
     start: Float[Tensor, "b 3"],
     command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, " 3"],
+    stiffness: Float[Tensor, "*each 3"],
     pose: Float[Tensor, "b 3"],
     contacts: ContactSet,
     settings: StepSettings,
@@ -97,7 +97,7 @@ def linear_response(
             columns.append(_solve(system, zero_force, -system.start_row[..., axis])[0])
         for axis in range(3):
             push = torch.zeros_like(zero_force)
-            push[:, axis] = stiffness[axis]
+            push[:, axis] = stiffness[..., axis]
             columns.append(_solve(system, push, torch.zeros_like(system.row_residual))[0])
         gap, lever = [], []
         for t in range(len(scene.terrains)):

@@ -25,6 +25,7 @@ from numba import njit
 from tpcd.qp import compiled
 from tpcd.simulator import kernel_geometry, kernel_settle, kernel_slopes
 from tpcd.simulator.kernel_geometry import (
+    World,
     build_chains,
     first_touch,
     new_chains,
@@ -35,6 +36,7 @@ from tpcd.simulator.kernel_settle import (
     INVALID,
     PROBE,
     RELAXED,
+    Law,
     linear_system,
     new_space,
     settle,
@@ -51,12 +53,16 @@ from tpcd.simulator.kernel_slopes import (
 
 
 class Request(NamedTuple):
-    """What is asked of b transitions: scene, start pose, command before and command of each.
+    """What is asked of b transitions: outline, planes, start pose, command before and command.
 
-    `rested` says that nothing was commanded before, so that `previous` equals the start.
+    `owner` and `place` (b) say whose points and whose planes of the `World` a transition has.
+    `stiffness` is (b or 1, 3). `rested` says that nothing was commanded before, so that
+    `previous` equals the start.
     """
 
     owner: np.ndarray
+    place: np.ndarray
+    stiffness: np.ndarray
     starts: np.ndarray
     previous: np.ndarray
     commands: np.ndarray
@@ -66,7 +72,11 @@ class Request(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """Where the answers go; the fields of `Transition` but the wrench."""
+    """Where the answers go; the fields of `Transition` but the wrench.
+
+    `contacts` (b, t, 4) are normal and tangential force, and the arm of the contact point from
+    the end effector in world axes.
+    """
 
     poses: np.ndarray
     modes: np.ndarray
@@ -75,6 +85,7 @@ class Answer(NamedTuple):
     from_start: np.ndarray
     from_gap: np.ndarray
     from_lever: np.ndarray
+    contacts: np.ndarray
 
 
 def source_stamp(*more: ModuleType) -> int:
@@ -113,26 +124,63 @@ def _step_range(world, law, request, answer, first, last):
         np.zeros((1, 0, 2, 1)), np.zeros((1, 0, terrains)), np.zeros((1, 0, terrains))
     )
     poses = np.zeros((7, 3))
+    normals, offsets, friction = new_planes(terrains)
+    law = own_law(law)
     b = first
     while b < last:
-        # Transitions of one scene that follow each other share its chains.
+        # Transitions of one outline that follow each other share its chains.
         o, end = request.owner[b], b + 1
         while end < last and request.owner[end] == o:
             end += 1
-        extent = prepare(world, o, law, request, b, end, chains)
+        here = World(world.points[o : o + 1], normals, offsets, friction)
+        set_planes(here, world.normals, world.offsets, world.friction, request.place[b])
+        extent = prepare(here, 0, law, request, b, end, chains)
         for element in range(b, end):
+            set_planes(here, world.normals, world.offsets, world.friction, request.place[element])
+            set_stiffness(law, request.stiffness[element if request.stiffness.shape[0] > 1 else 0])
             step_element(
-                world, o, chains, law, extent, request, element, answer, space, slopes, poses,
-                by_theta,
+                here, 0, chains, law, extent, request, element, answer, space, slopes, poses,
+                by_theta, 0,
             )  # fmt: skip
         b = end
+
+
+@njit
+@no_type_check
+def new_planes(terrains):
+    """Room for the planes of one transition."""
+    return np.zeros((1, terrains, 2)), np.zeros((1, terrains)), np.zeros((1, terrains))
+
+
+@njit
+@no_type_check
+def own_law(law):
+    """A copy of the law whose stiffness can be set for each transition."""
+    return Law(np.ones(3), np.ones(3), law.coulomb, law.rounds, law.tolerance, law.compliance)
+
+
+@njit(_nrt=False)
+@no_type_check
+def set_planes(here, normals, offsets, friction, place):
+    """Take over the planes at a place of (.., t, 2) and (.., t)."""
+    for t in range(here.offsets.shape[1]):
+        here.normals[0, t, 0], here.normals[0, t, 1] = normals[place, t, 0], normals[place, t, 1]
+        here.offsets[0, t], here.friction[0, t] = offsets[place, t], friction[place, t]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def set_stiffness(law, stiffness):
+    """Take over a stiffness (3) and its root."""
+    for a in range(3):
+        law.stiffness[a], law.root[a] = stiffness[a], math.sqrt(stiffness[a])
 
 
 @njit(_nrt=False)
 @no_type_check
 def prepare(world, o, law, request, first, last, chains):
     """Chains of a scene for some transitions; returns how far its outline reaches [m]."""
-    extent = _extent(world, o)
+    extent = _reach(world, o)
     if math.isfinite(extent):
         low, high = _angles(request, first, last)
         lean = 0.0 if law.coulomb else _largest(world.friction, o) * (high - low)
@@ -142,18 +190,28 @@ def prepare(world, o, law, request, first, last, chains):
 
 @njit(_nrt=False)
 @no_type_check
-def _extent(world, o):
-    """Distance of the furthest point from the end effector [m]; not finite for a bad scene."""
+def _reach(world, o):
+    """Distance of the furthest point from the end effector [m]; not finite for a bad outline."""
     largest, total = 0.0, 0.0
     for i in range(world.points.shape[2]):
         square = world.points[o, 0, i] ** 2 + world.points[o, 1, i] ** 2
         total += square
         largest = max(largest, square)
+    # A NaN is no maximum, but it spoils the sum.
+    return math.sqrt(largest) if math.isfinite(total) else np.nan
+
+
+@njit(_nrt=False)
+@no_type_check
+def _sound(world, o, law):
+    """Whether planes and stiffness are finite, and the stiffness positive."""
+    total = 0.0
     for t in range(world.normals.shape[1]):
         total += abs(world.offsets[o, t]) + abs(world.friction[o, t])
         total += abs(world.normals[o, t, 0]) + abs(world.normals[o, t, 1])
-    # A NaN is no maximum, but it spoils the sum.
-    return math.sqrt(largest) if math.isfinite(total) else np.nan
+    for a in range(3):
+        total += law.root[a] if law.stiffness[a] > 0.0 else np.inf
+    return math.isfinite(total)
 
 
 @njit(_nrt=False)
@@ -191,8 +249,12 @@ def wrap(angle):
 
 @njit(nogil=True, error_model="numpy", _nrt=False)
 @no_type_check
-def step_element(world, o, chains, law, extent, request, b, answer, space, slopes, poses, by_theta):
+def step_element(
+    world, o, chains, law, extent, request, b, answer, space, slopes, poses, by_theta, moved
+):  # fmt: skip
     """One transition: rest on what was touched, go to the command, follow its path if need be.
+
+    `moved` is the element of `by_theta`.
 
     Leaves the derivatives by theta, of a given start pose, in `slopes.theta`.
     """
@@ -200,7 +262,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
     landing, pose, kept_pose = poses[4], poses[5], poses[6]
     whole, terrains = slopes.whole, world.normals.shape[1]
     height = 3 + 2 * terrains
-    finite = math.isfinite(extent)
+    finite = math.isfinite(extent) and _sound(world, o, law)
     for a in range(3):
         start[a], before[a] = request.starts[b, a], request.previous[b, a]
         command[a] = request.commands[b, a]
@@ -209,7 +271,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
         answer.statuses[b], answer.residuals[b] = INVALID, np.inf
         answer.poses[b], answer.modes[b] = np.nan, 0
         answer.from_start[b], answer.from_gap[b] = np.nan, np.nan
-        answer.from_lever[b] = np.nan
+        answer.from_lever[b], answer.contacts[b] = np.nan, np.nan
         return
     before[2] = start[2] + wrap(before[2] - start[2])
     command[2] = start[2] + wrap(command[2] - start[2])
@@ -269,7 +331,9 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
             linear_system(world, o, law, part, pose, turn, space)
             settling_response(law, terrains, space, slopes)
             append_part(slopes, follows, space.force, space.right)
-            append_theta(world, o, law, by_theta, (point, terrain), landing, pose, space, slopes)
+            append_theta(
+                world, o, law, by_theta, moved, (point, terrain), landing, pose, space, slopes
+            )
         if run == 0:
             touched, status, residual = _loaded(space), CONVERGED, 0.0
         elif run == 1 and substeps > 1:
@@ -281,6 +345,7 @@ def step_element(world, o, chains, law, extent, request, b, answer, space, slope
     for a in range(3):
         answer.poses[b, a] = pose[a]
     _modes(space, answer.modes, b)
+    _contacts(world, o, pose, space, answer.contacts, b)
     answer.statuses[b], answer.residuals[b] = status, residual
     copy_rows(whole, 0, answer.from_start[b], 3)
     copy_rows(whole, 3, answer.from_gap[b], terrains)
@@ -311,6 +376,28 @@ def _modes(space, modes, b):
                 largest = load
                 slip = 2 if space.side[j] < 0.0 else 3
                 modes[b, t] = slip if space.slipping[j] else 1
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def _contacts(world, o, pose, space, contacts, b):
+    """Forces of each terrain and the arm of their point, weighted by load."""
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    contacts[b] = 0.0
+    for j in range(3):
+        load = space.multiplier[j]
+        if space.chosen[j, 0] < 0 or not load > 0.0:
+            continue
+        t, k = space.chosen[j, 1], space.chosen[j, 2]
+        x, z = space.place[t, k, 0], space.place[t, k, 1]
+        contacts[b, t, 0] += load
+        contacts[b, t, 1] += load * space.side[j] * world.friction[o, t]
+        contacts[b, t, 2] += load * (cosine * x - sine * z)
+        contacts[b, t, 3] += load * (sine * x + cosine * z)
+    for t in range(contacts.shape[1]):
+        if contacts[b, t, 0] > 0.0:
+            contacts[b, t, 2] /= contacts[b, t, 0]
+            contacts[b, t, 3] /= contacts[b, t, 0]
 
 
 step_range = _compile_step_range(source_stamp())

@@ -174,10 +174,11 @@ def append_part(slopes, follows, column, middle):
 
 @njit(_nrt=False)
 @no_type_check
-def append_theta(world, o, law, by_theta, touch, landing, pose, space, slopes):
+def append_theta(world, o, law, by_theta, moved, touch, landing, pose, space, slopes):
     """Append one settling to the derivatives of the whole step by theta.
 
-    `touch` is (point, terrain) of the first touch in the pose `landing`. At a given pose, an
+    `moved` is the element of `by_theta`, `touch` (point, terrain) of the first touch in the pose
+    `landing`. At a given pose, an
     entry of theta leaves a force on the balance and right-hand sides of the rows.
     """
     point, terrain = touch
@@ -194,14 +195,14 @@ def append_theta(world, o, law, by_theta, touch, landing, pose, space, slopes):
             nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
             u, v = object_normal(world, o, t, turn[0], turn[1])
             u_start, v_start = object_normal(world, o, t, start_turn[0], start_turn[1])
-            x, z = by_theta.points[o, e, 0, p], by_theta.points[o, e, 1, p]
+            x, z = by_theta.points[moved, e, 0, p], by_theta.points[moved, e, 1, p]
             height, along = u * x + v * z, v * x - u * z
             slope = space.side[j] * world.friction[o, t]
-            more = space.side[j] * by_theta.friction[o, e, t]
+            more = space.side[j] * by_theta.friction[moved, e, t]
             drag, more_drag = (0.0, 0.0) if law.coulomb and space.slipping[j] else (slope, more)
             at_x, at_z = space.place[t, k, 0], space.place[t, k, 1]
             slip = v * at_x - u * at_z + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
-            gap = height - by_theta.offsets[o, e, t]
+            gap = height - by_theta.offsets[moved, e, t]
             space.right[j] = -(gap + drag * (along - (v_start * x - u_start * z)))
             space.right[j] -= more_drag * slip
             load = space.multiplier[j]
@@ -210,8 +211,8 @@ def append_theta(world, o, law, by_theta, touch, landing, pose, space, slopes):
             space.force[2] += load * (along - slope * height - more * (u * at_x + v * at_z))
         respond(space)
         u, v = object_normal(world, o, terrain, start_turn[0], start_turn[1])
-        gap = u * by_theta.points[o, e, 0, point] + v * by_theta.points[o, e, 1, point]
-        gap -= by_theta.offsets[o, e, terrain]
+        gap = u * by_theta.points[moved, e, 0, point] + v * by_theta.points[moved, e, 1, point]
+        gap -= by_theta.offsets[moved, e, terrain]
         for a in range(3):
             space.force[a] = theta[e, a]
         for a in range(3):

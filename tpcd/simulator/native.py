@@ -14,6 +14,7 @@ from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -101,10 +102,13 @@ def step(
     start: Float[Tensor, "b 3"],
     previous: Float[Tensor, "b 3"] | None,
     command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, " 3"],
+    stiffness: Float[Tensor, "#b 3"],
     settings: StepSettings,
 ) -> Transition:
-    """Step b transitions; `owner` gives the position of each one's scene in the flat batch."""
+    """Step b transitions; `owner` gives the position of each one's scene in the flat batch.
+
+    Outlines may broadcast against the planes of the scene and are then not repeated.
+    """
     from tpcd.simulator.kernel import Answer, step_range
 
     count, terrains = len(owner), len(scene.terrains)
@@ -115,8 +119,9 @@ def step(
     from_start = torch.empty(count, 3, 3, dtype=torch.float64)
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
-    world, law = world_of(scene), law_of(stiffness, settings)
-    request = request_of(owner, start, previous, command, settings)
+    contacts = torch.empty(count, terrains, 4, dtype=torch.float64)
+    world, law = world_of(scene), law_of(settings)
+    request = request_of(scene, owner, start, previous, command, stiffness, settings)
     answer = Answer(
         pose.numpy(),
         mode.numpy(),
@@ -125,13 +130,16 @@ def step(
         from_start.numpy(),
         from_gap.numpy(),
         from_lever.numpy(),
+        contacts.numpy(),
     )
     in_parts(lambda first, last: step_range(world, law, request, answer, first, last), count)
     turn = start[:, 2].double() + wrap_angle(command[:, 2].double() - start[:, 2].double())
     target = torch.cat((command[:, :2].double(), turn[:, None]), dim=-1)
     wrench = stiffness.double() * (pose - target)
     pose[:, 2] = wrap_angle(pose[:, 2])
-    return Transition(pose, wrench, mode, status, residual, from_start, from_gap, from_lever)
+    return Transition(
+        pose, wrench, mode, status, residual, from_start, from_gap, from_lever, contacts
+    )
 
 
 def world_of(scene: ContactScene) -> World:
@@ -152,13 +160,13 @@ def world_of(scene: ContactScene) -> World:
     )
 
 
-def law_of(stiffness: Float[Tensor, " 3"], settings: StepSettings) -> Law:
-    """Impedance and settings, as the compiled loops read them."""
+def law_of(settings: StepSettings) -> Law:
+    """Settings as the compiled loops read them; the stiffness is set for each transition."""
     from tpcd.simulator.kernel_settle import Law
 
     return Law(
-        stiffness.detach().double().numpy(),
-        stiffness.detach().double().sqrt().numpy(),
+        np.ones(3),
+        np.ones(3),
         settings.friction == "coulomb",
         settings.rounds,
         settings.tolerance,
@@ -167,17 +175,23 @@ def law_of(stiffness: Float[Tensor, " 3"], settings: StepSettings) -> Law:
 
 
 def request_of(
+    scene: ContactScene,
     owner: Int[Tensor, " b"],
     start: Float[Tensor, "b 3"],
     previous: Float[Tensor, "b 3"] | None,
     command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, "#b 3"],
     settings: StepSettings,
 ) -> Request:
     """Transitions, as the compiled loops read them."""
     from tpcd.simulator.kernel import Request
 
+    outlines = scene.points_ee.shape[:-2]
+    mine = torch.arange(outlines.numel()).reshape(outlines).expand(scene.batch_shape).reshape(-1)
     return Request(
+        mine[owner].numpy(),
         owner.numpy(),
+        _flat(stiffness.detach(), 3),
         _flat(start.detach(), 3),
         _flat((start if previous is None else previous).detach(), 3),
         _flat(command.detach(), 3),

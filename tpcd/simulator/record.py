@@ -115,3 +115,6 @@ class Transition:
     pose_from_lever: Float[Tensor, "*batch t 3"]
     """Derivative of the settled pose with respect to the lever of terrain t, the tangential
     offset of the contact point from the end effector [m]: what a shifted contact point does."""
+    contacts: Float[Tensor, "*batch t 4"]
+    """Force along the normal and along the tangent of terrain t [N], and the arm of the contact
+    point from the end effector in world axes (x, z) [m]; zero without contact."""

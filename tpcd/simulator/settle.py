@@ -65,7 +65,7 @@ def settle(
     scene: ContactScene,
     start: Float[Tensor, "b 3"],
     command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, " 3"],
+    stiffness: Float[Tensor, "*each 3"],
     settings: StepSettings,
 ) -> Settled:
     """Rest pose and loaded contacts for each element; no gradient is recorded."""
@@ -92,7 +92,9 @@ def _settle(
         rows = _candidate_rows(
             part, start[running], pose[running], _take(contacts, running), load[running], settings
         )
-        step, found, relaxed = _solve_rows(rows, command[running] - pose[running], stiffness)
+        step, found, relaxed = _solve_rows(
+            rows, command[running] - pose[running], own(stiffness, running)
+        )
         after = pose[running] + step
         found = _with_slip(part, start[running], after, found, settings.tolerance)
         _put(contacts, running, found)
@@ -104,7 +106,13 @@ def _settle(
         settled = (change <= settings.tolerance) & ~relaxed
         if k < NEWTON_ROUNDS:
             polished, multiplier = newton_step(
-                part, start[running], command[running], stiffness, after, found, settings
+                part,
+                start[running],
+                command[running],
+                own(stiffness, running),
+                after,
+                found,
+                settings,
             )
             # A step beyond what this round moved comes from a wrong guess of the contacts.
             small = _motion(polished - after, extent[running]) <= 2 * change
@@ -125,7 +133,8 @@ def _settle(
     yielding = torch.zeros_like(status, dtype=torch.bool)
     if len(jammed) > 0 and bool((scene.friction[jammed] != 0).any()):
         part = _without_friction(scene.gather(jammed))
-        free = _settle(part, start[jammed], command[jammed], stiffness, settings)
+        own_stiffness = own(stiffness, jammed)
+        free = _settle(part, start[jammed], command[jammed], own_stiffness, settings)
         pose[jammed], residual[jammed] = free.pose, free.residual
         yielding[jammed] = free.yielding
         _put(contacts, jammed, free.contacts)
@@ -133,6 +142,11 @@ def _settle(
         # Terrains that face each other jam without friction too.
         yielding[jammed] = True
     return Settled(pose, contacts, status, residual, yielding)
+
+
+def own(stiffness: Float[Tensor, "*each 3"], index: Tensor) -> Tensor:
+    """The stiffness of some elements: shared by all, or one for each."""
+    return stiffness if stiffness.ndim == 1 else stiffness[index]
 
 
 def _without_friction(scene: ContactScene) -> ContactScene:
@@ -196,7 +210,7 @@ def _solve_rows(
     """Motion to the minimum, the contacts loaded there, and which elements were relaxed."""
     solution = solve(
         ContactQP(
-            hessian=torch.diag(stiffness),
+            hessian=torch.diag_embed(stiffness),
             target=target,
             rows=rows.jacobian,
             offsets=rows.offset,

@@ -18,10 +18,10 @@ from tpcd.contact import ContactScene
 from tpcd.planar import wrap_angle
 from tpcd.simulator import native
 from tpcd.simulator.flight import FREE_GAP, Flight, first_touch, touch_row
-from tpcd.simulator.implicit import linear_response, newton_pose
+from tpcd.simulator.implicit import linear_response, loaded_frames, newton_pose
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus, Transition
-from tpcd.simulator.settle import Settled, settle
+from tpcd.simulator.settle import Settled, own, settle
 from tpcd.terrain import HalfPlane
 
 Engine = Literal["auto", "torch", "native"]
@@ -34,7 +34,7 @@ def simulate_step(
     scene: ContactScene,
     pose: Float[Tensor, "*batch 3"],
     command: Float[Tensor, "*#batch 3"],
-    stiffness: Float[Tensor, " 3"],
+    stiffness: Float[Tensor, "*#batch 3"],
     settings: StepSettings = DEFAULT_SETTINGS,
     engine: Engine = "auto",
     previous: Float[Tensor, "*#batch 3"] | None = None,
@@ -46,16 +46,16 @@ def simulate_step(
     depends; a measured start pose is first settled under it, which puts it back on the
     contact it had. Without it the arm is taken to rest without load, `previous = pose`.
 
-    The batch axes of `scene`, `pose` and the commands are broadcast against each other.
-    `stiffness` is the diagonal of K [N/m, N/m, N·m/rad]. Contact is solved in float64.
+    The batch axes of `scene`, `pose`, the commands and the stiffness are broadcast against each
+    other. `stiffness` is the diagonal of K [N/m, N/m, N·m/rad]. Contact is solved in float64.
     Raises ValueError for a stiffness that is not positive.
     """
-    if stiffness.shape != (3,) or not bool((stiffness > 0).all()):
+    if stiffness.shape[-1:] != (3,) or not bool((stiffness > 0).all()):
         raise ValueError(f"stiffness is {stiffness.tolist()}, expected three positive numbers")
-    commands = (command,) if previous is None else (command, previous)
-    batch = torch.broadcast_shapes(
-        scene.batch_shape, pose.shape[:-1], *(given.shape[:-1] for given in commands)
-    )
+    given = (pose, command, stiffness) if previous is None else (pose, command, stiffness, previous)
+    batch = torch.broadcast_shapes(scene.batch_shape, *(one.shape[:-1] for one in given))
+    if stiffness.ndim > 1:
+        stiffness = stiffness.expand(*batch, 3).reshape(-1, 3)
     pose = pose.expand(*batch, 3).reshape(-1, 3)
     command = command.expand(*batch, 3).reshape(-1, 3)
     previous = None if previous is None else previous.expand(*batch, 3).reshape(-1, 3)
@@ -64,7 +64,8 @@ def simulate_step(
     if _use_native(
         engine, scene, (pose, stiffness, command, *(() if previous is None else (previous,)))
     ):
-        flat = native.step(scene, owner, pose, previous, command, stiffness, settings)
+        shared = stiffness.reshape(-1, 3)
+        flat = native.step(scene, owner, pose, previous, command, shared, settings)
         _relax_jammed(flat, scene, owner, pose, previous, command, stiffness, settings)
     else:
         flat = _step_finite(
@@ -80,6 +81,7 @@ def simulate_step(
         pose_from_start=flat.pose_from_start.reshape(*batch, 3, 3),
         pose_from_gap=flat.pose_from_gap.reshape(*batch, terrains, 3),
         pose_from_lever=flat.pose_from_lever.reshape(*batch, terrains, 3),
+        contacts=flat.contacts.reshape(*batch, terrains, 4),
     )
 
 
@@ -142,7 +144,12 @@ def _relax_jammed(
         return
     before = None if previous is None else previous[jammed]
     part = _step(
-        scene.gather(owner[jammed]), pose[jammed], before, command[jammed], stiffness, settings
+        scene.gather(owner[jammed]),
+        pose[jammed],
+        before,
+        command[jammed],
+        own(stiffness, jammed),
+        settings,
     )
     for name in vars(part):
         getattr(flat, name)[jammed] = getattr(part, name)
@@ -168,7 +175,9 @@ def _step_finite(
         return _step(scene, start, previous, command, stiffness, settings)
     index = torch.nonzero(finite).flatten()
     before = None if previous is None else previous[index]
-    part = _step(scene.gather(index), start[index], before, command[index], stiffness, settings)
+    part = _step(
+        scene.gather(index), start[index], before, command[index], own(stiffness, index), settings
+    )
     blank = {"mode": int(ContactMode.FREE), "status": int(StepStatus.INVALID_INPUT)}
     whole = {}
     for name, value in vars(part).items():
@@ -186,6 +195,7 @@ class _State:
     from_start: Tensor
     from_gap: Tensor
     from_lever: Tensor
+    contacts: Tensor
     mode: Tensor
     status: Tensor
     residual: Tensor
@@ -240,7 +250,9 @@ def _step(
             share, target = k / settings.substeps, command[index]
             if k < settings.substeps:
                 target = path_start[index] + share * (target - path_start[index])
-            state = _advance(part_scene, state, target, follows * (1 - share), stiffness, settings)
+            state = _advance(
+                part_scene, state, target, follows * (1 - share), own(stiffness, index), settings
+            )
         spread = torch.zeros_like(winding, dtype=torch.long)
         spread[index] = torch.arange(len(index), device=index.device)
         followed = _State(**{name: value[spread] for name, value in vars(state).items()})
@@ -254,6 +266,7 @@ def _step(
         pose_from_start=end.from_start,
         pose_from_gap=end.from_gap,
         pose_from_lever=end.from_lever,
+        contacts=end.contacts,
     )
 
 
@@ -272,6 +285,7 @@ def _start_state(scene: ContactScene, start: Tensor) -> _State:
         from_start=torch.eye(3).to(start).expand(count, 3, 3),
         from_gap=zeros,
         from_lever=zeros,
+        contacts=start.new_zeros(count, terrains, 4),
         mode=torch.zeros(count, terrains, dtype=torch.long, device=start.device),
         status=whole,
         residual=start.new_zeros(count),
@@ -312,6 +326,7 @@ def _advance(
         from_lever=(response.lever + landed_from_lever @ response.start.mT).where(
             stands[..., None], 0.0
         ),
+        contacts=_contact_forces(scene, settled),
         mode=_contact_modes(settled, len(scene.terrains)),
         status=torch.maximum(state.status, settled.status),
         residual=torch.maximum(state.residual, settled.residual),
@@ -362,3 +377,19 @@ def _contact_modes(settled: Settled, terrains: int) -> Tensor:
         mode = torch.where(slipping & ~positive, int(ContactMode.SLIP_NEGATIVE), mode)
         modes.append(torch.where(largest > 0, mode, int(ContactMode.FREE)))
     return torch.cat(modes, dim=-1)
+
+
+def _contact_forces(scene: ContactScene, settled: Settled) -> Tensor:
+    """Normal and tangential force, and the arm of the contact point, of each terrain."""
+    contacts = settled.contacts
+    frames = loaded_frames(scene, settled.pose, contacts)
+    arm = (frames.points_world - settled.pose[:, None, :2]).detach()
+    found = []
+    for t in range(len(scene.terrains)):
+        load = torch.where(contacts.terrain == t, contacts.multiplier, 0.0)
+        normal = load.sum(-1)
+        tangential = (load * contacts.side).sum(-1) * scene.friction[:, t].detach()
+        share = load / torch.where(normal > 0, normal, 1.0)[:, None]
+        place = (share[..., None] * arm).sum(1)
+        found.append(torch.cat((normal[:, None], tangential[:, None], place), dim=-1))
+    return torch.stack(found, dim=1)

@@ -28,6 +28,11 @@ from torch import Tensor
 from tpcd.errors import SolverError
 from tpcd.truth.hull import hull_vertices
 
+POINT_RADIUS = 1e-6
+"""Of the spheres that stand for points of the outline; planes are set back by it [m]."""
+INERTIAL_XML = '<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
+"""Next to no mass: the arm's inertia sits in its joints."""
+
 Transition = tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]
 
 
@@ -85,18 +90,14 @@ class MujocoTruth:
         if not bool((stiffness > 0).all()):
             raise ValueError(f"stiffness is {stiffness.tolist()}, expected > 0 on every axis")
         self.settings = settings or MujocoSettings()
-        self._mujoco = _load_mujoco()
+        self._mujoco = load_mujoco()
         self._stiffness = stiffness.detach().numpy().astype(np.float64)
         hull = hull_vertices(outline_vertices_ee.detach().numpy().astype(np.float64))
-        xml = _scene_xml(
-            hull, friction, floor_height, wall_position, self._stiffness, self.settings
-        )
+        xml = scene_xml(hull, friction, floor_height, wall_position, self._stiffness, self.settings)
         self._model = self._mujoco.MjModel.from_xml_string(xml)
         self._data = self._mujoco.MjData(self._model)
         self._isolated = self._mujoco.MjData(self._model)
         self._command = np.zeros(3)
-        kinds = self._mujoco.mjtWarning
-        self._fatal = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
 
     def reset(self, pose: Float[Tensor, " 3"]) -> None:
         """Put the arm at rest at a pose with the command equal to it [m, m, rad]."""
@@ -129,35 +130,58 @@ class MujocoTruth:
     def _move(self, data: Any, start: np.ndarray, end: np.ndarray) -> Transition:
         if not np.isfinite((start, end)).all():
             raise ValueError(f"command goes from {start} to {end}, expected finite numbers")
-        complaints: list[str] = []
-        with _warnings_to(self._mujoco, complaints.append):
-            settled = self._ramp_and_hold(data, start, end)
-        # On these MuJoCo restarts from zero by itself, which must not pass for an answer.
-        if any(data.warning[kind].number for kind in self._fatal):
-            raise SolverError(
-                f"MuJoCo became unstable: {complaints[-1]} Check the command or lower the time step"
-            )
+        with stability_check(self._mujoco, data):
+            settled = ramp_and_hold(
+                lambda steps: self._mujoco.mj_step(self._model, data, steps),
+                data, start, end, self._stiffness, self.settings,
+            )  # fmt: skip
         pose = data.qpos.copy()
         wrench = self._stiffness * (pose - end)
         return torch.from_numpy(pose), torch.from_numpy(wrench), settled
 
-    def _ramp_and_hold(self, data: Any, start: np.ndarray, end: np.ndarray) -> bool:
-        """Move the command, then advance until the arm stands still; whether it did."""
-        advance, settings = self._mujoco.mj_step, self.settings
-        ramp_steps = max(1, round(settings.ramp_time / settings.time_step))
-        for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
-            data.ctrl[:] = start + fraction * (end - start)
-            advance(self._model, data)
-        damping = self._stiffness * settings.damping_time
-        block = max(1, round(0.05 / settings.time_step))
-        for _ in range(max(1, round(settings.hold_time / settings.time_step / block))):
-            before = data.qpos.copy()
-            advance(self._model, data, block)
-            # The mean speed over the block, so that a chattering contact counts as at rest.
-            speed = np.abs(data.qpos - before) / (block * settings.time_step)
-            if (damping * speed).max() < settings.settled_force:
-                return True
-        return False
+
+def ramp_and_hold(
+    advance: Callable[[int], None],
+    data: Any,
+    start: np.ndarray,
+    end: np.ndarray,
+    stiffness: np.ndarray,
+    settings: MujocoSettings,
+) -> bool:
+    """Move the command, then advance until the arm stands still; whether it did.
+
+    `advance` integrates so many time steps of `data`, whose first three coordinates and
+    controls are the arm's.
+    """
+    ramp_steps = max(1, round(settings.ramp_time / settings.time_step))
+    for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
+        data.ctrl[:3] = start + fraction * (end - start)
+        advance(1)
+    damping = stiffness * settings.damping_time
+    block = max(1, round(0.05 / settings.time_step))
+    for _ in range(max(1, round(settings.hold_time / settings.time_step / block))):
+        before = data.qpos[:3].copy()
+        advance(block)
+        # The mean speed over the block, so that a chattering contact counts as at rest.
+        speed = np.abs(data.qpos[:3] - before) / (block * settings.time_step)
+        if (damping * speed).max() < settings.settled_force:
+            return True
+    return False
+
+
+@contextmanager
+def stability_check(mujoco: ModuleType, data: Any) -> Iterator[None]:
+    """Raise `SolverError` if `data` became unstable inside the block."""
+    complaints: list[str] = []
+    with _warnings_to(mujoco, complaints.append):
+        yield
+    kinds = mujoco.mjtWarning
+    # On these MuJoCo restarts from zero by itself, which must not pass for an answer.
+    fatal = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
+    if any(data.warning[kind].number for kind in fatal):
+        raise SolverError(
+            f"MuJoCo became unstable: {complaints[-1]} Check the command or lower the time step"
+        )
 
 
 @contextmanager
@@ -171,7 +195,8 @@ def _warnings_to(mujoco: ModuleType, receive: Callable[[str], None]) -> Iterator
         mujoco.set_mju_user_warning(before)
 
 
-def _load_mujoco() -> ModuleType:
+def load_mujoco() -> ModuleType:
+    """The mujoco package; raises `SolverError` where it is not installed."""
     try:
         import mujoco
     except ImportError as error:
@@ -182,7 +207,7 @@ def _load_mujoco() -> ModuleType:
     return mujoco
 
 
-def _scene_xml(
+def scene_xml(
     hull: np.ndarray,
     friction: float,
     floor_height: float,
@@ -191,45 +216,64 @@ def _scene_xml(
     settings: MujocoSettings,
 ) -> str:
     """The model as MuJoCo XML; MuJoCo's x and z are ours, and phi turns about -y."""
-    radius = 1e-6
-    light, deep, depth = settings.impedance
-    contact = (
-        f'condim="3" friction="{friction!r} 0 0" '
-        f'solref="{settings.contact_steps * settings.time_step!r} 1" '
-        f'solimp="{light!r} {deep!r} {depth!r} 0.5 2"'
-    )
-    joints, actuators = [], []
-    for name, kind, axis, value in zip(
-        ("x", "z", "phi"), ("slide", "slide", "hinge"), ("1 0 0", "0 0 1", "0 -1 0"),
-        stiffness.tolist(), strict=True,
-    ):  # fmt: skip
-        joints.append(
-            f'<joint name="{name}" type="{kind}" axis="{axis}"'
-            f' damping="{value * settings.damping_time!r}"'
-            f' armature="{value * settings.inertia_time**2!r}"/>'
-        )
-        actuators.append(f'<position joint="{name}" kp="{value!r}"/>')
+    contact = f'condim="3" friction="{friction!r} 0 0" {contact_softness_xml(settings)}'
+    joints, actuators = impedance_xml(stiffness, settings)
     spheres = "".join(
-        f'<geom type="sphere" size="{radius!r}" pos="{x!r} 0 {z!r}" {contact}'
+        f'<geom type="sphere" size="{POINT_RADIUS!r}" pos="{x!r} 0 {z!r}" {contact}'
         ' contype="1" conaffinity="0"/>'
         for x, z in hull.tolist()
     )
     plane = f'type="plane" size="1 1 1" {contact} contype="0" conaffinity="1"'
     return f"""
     <mujoco>
-      <compiler angle="radian"/>
-      <option timestep="{settings.time_step!r}" gravity="0 0 0" integrator="implicitfast"
-              cone="elliptic" impratio="{settings.impratio!r}"
-              solver="Newton" iterations="100" tolerance="1e-12"
-              noslip_iterations="{settings.noslip_iterations}" noslip_tolerance="1e-12"/>
+      {options_xml(settings)}
       <worldbody>
-        <geom {plane} pos="0 0 {floor_height - radius!r}" zaxis="0 0 1"/>
-        <geom {plane} pos="{wall_position + radius!r} 0 0" zaxis="-1 0 0"/>
+        <geom {plane} pos="0 0 {floor_height - POINT_RADIUS!r}" zaxis="0 0 1"/>
+        <geom {plane} pos="{wall_position + POINT_RADIUS!r} 0 0" zaxis="-1 0 0"/>
         <body>
-          <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>
-          {"".join(joints)}
+          {INERTIAL_XML}
+          {joints}
           {spheres}
         </body>
       </worldbody>
-      <actuator>{"".join(actuators)}</actuator>
+      <actuator>{actuators}</actuator>
     </mujoco>"""
+
+
+def options_xml(settings: MujocoSettings) -> str:
+    """Compiler and integrator of a scene."""
+    return f"""<compiler angle="radian"/>
+      <option timestep="{settings.time_step!r}" gravity="0 0 0" integrator="implicitfast"
+              cone="elliptic" impratio="{settings.impratio!r}"
+              solver="Newton" iterations="100" tolerance="1e-12"
+              noslip_iterations="{settings.noslip_iterations}" noslip_tolerance="1e-12"/>"""
+
+
+def contact_softness_xml(settings: MujocoSettings) -> str:
+    """Attributes of a contact that say how soft it is."""
+    light, deep, depth = settings.impedance
+    return (
+        f'solref="{settings.contact_steps * settings.time_step!r} 1" '
+        f'solimp="{light!r} {deep!r} {depth!r} 0.5 2"'
+    )
+
+
+def impedance_xml(
+    stiffness: np.ndarray, settings: MujocoSettings, attributes: tuple[str, str, str] = ("", "", "")
+) -> tuple[str, str]:
+    """Joints of the arm along x, z and about phi, and their position actuators.
+
+    `attributes` are further ones for the three joints.
+    """
+    joints, actuators = [], []
+    for name, kind, axis, value, further in zip(
+        ("x", "z", "phi"), ("slide", "slide", "hinge"), ("1 0 0", "0 0 1", "0 -1 0"),
+        stiffness.tolist(), attributes, strict=True,
+    ):  # fmt: skip
+        joints.append(
+            f'<joint name="{name}" type="{kind}" axis="{axis}"'
+            f' damping="{value * settings.damping_time!r}"'
+            f' armature="{value * settings.inertia_time**2!r}" {further}/>'
+        )
+        actuators.append(f'<position joint="{name}" kp="{value!r}"/>')
+    return "".join(joints), "".join(actuators)

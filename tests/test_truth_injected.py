@@ -1,0 +1,432 @@
+"""Effects injected into MuJoCo, each against a closed form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tpcd.truth.injected import InjectedMujocoTruth, sensor_effects
+from tpcd.truth.injected_effects import FORMS
+from tpcd.truth.mujoco_truth import MujocoTruth
+from tpcd.truth.protocol import Truth
+from tpcd.truth.scene import Scene
+
+FORCE = 5e-3
+"""Closed forms hold to this [N]; torques to the same number [N·m]."""
+LENGTH = 3e-5
+"""Closed forms hold to this [m]."""
+
+
+def vector(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+SLAB = vector(-0.05, -0.03, 0.05, -0.03, 0.05, 0.03, -0.05, 0.03).reshape(4, 2)
+TOWER = SLAB.flip(-1).flip(0)
+"""The slab on its end: it meets the wall with a long face."""
+WEDGE = vector(0.0, -0.05, 0.04, 0.05, -0.04, 0.05).reshape(3, 2)
+"""Touches the floor in one point below the hand."""
+HOOK = vector(0.04, -0.05, 0.05, 0.05, -0.05, 0.05).reshape(3, 2)
+"""Touches the floor in one point to the right of the hand."""
+NOMINAL = 0.4
+
+
+def make_scene(vertices=SLAB, friction=NOMINAL, floor=0.0, wall=0.5, start=(0.0, 0.06, 0.0)):
+    stiffness = vector(100.0, 100.0, 50.0)
+    mount = vector(0.0, 0.0, 0.0)
+    return Scene("s", vertices, 1.0, mount, friction, floor, wall, vector(*start), stiffness)
+
+
+def follow(hidden, *commands, steps=None, **scene) -> np.ndarray:
+    """Rows (n, 6) of pose and wrench; every step settles and agrees with the contact forces."""
+    truth = InjectedMujocoTruth(make_scene(**scene), hidden, steps or len(commands))
+    rows = []
+    for command in commands:
+        pose, wrench, settled = truth.step(vector(*command))
+        assert settled
+        assert torch.allclose(wrench, truth.external_wrench(), atol=FORCE)
+        rows.append(torch.cat((pose, wrench)).numpy())
+    return np.array(rows)
+
+
+def lowest(vertices: torch.Tensor, pose: np.ndarray, turn: float = 0.0, shift: float = 0.0):
+    """World position of the lowest vertex, the object turned and shifted in the hand."""
+
+    def rotate(points, angle):
+        cosine, sine = math.cos(angle), math.sin(angle)
+        return points @ np.array([[cosine, sine], [-sine, cosine]])
+
+    held = rotate(vertices.numpy(), turn) + [shift, 0.0]
+    points = rotate(held, pose[2]) + pose[:2]
+    return points[points[:, 1].argmin()]
+
+
+def random_commands(seed: int, steps: int = 6) -> list[list[float]]:
+    generator = np.random.default_rng(seed)
+    return generator.uniform((-0.02, -0.01, -0.15), (0.09, 0.05, 0.15), (steps, 3)).tolist()
+
+
+NULLS = {
+    "floor_tilt": {"angle": 0.0},
+    "static_kinetic": {"ratio": 1.0},
+    "grasp_slip": {"angle": 0.0, "shift": 0.0, "at": 0.5},
+    "payload": {"weight": 0.0, "lever": 0.1},
+    "command_lag": {"share": 0.0},
+    "force_gain": {},
+}
+
+
+@pytest.mark.parametrize("hidden", [{}, NULLS])
+def test_without_effects_the_answers_are_those_of_the_undisturbed_truth(hidden):
+    scene = make_scene(HOOK, wall=0.1)
+    injected = InjectedMujocoTruth(scene, hidden, 6)
+    plain = MujocoTruth(
+        scene.vertices_ee, scene.friction, scene.floor_height, scene.wall_position, scene.stiffness
+    )
+    plain.reset(scene.start_pose)
+    assert isinstance(injected, Truth)
+    for command in random_commands(0):
+        ours, theirs = injected.step(vector(*command)), plain.step(vector(*command))
+        assert torch.equal(ours[0], theirs[0]) and torch.equal(ours[1], theirs[1])
+
+
+@pytest.mark.parametrize(
+    "tiny",
+    [
+        {"floor_tilt": {"angle": 1e-9}},
+        {"floor_curvature": {"curvature": -1e-9}},
+        {"floor_compliance": {"compliance": 1e-8}, "wall_compliance": {"compliance": 1e-8}},
+        {"grasp_compliance": {"compliance": 1e-5}},
+        {"directional_friction": {"log_ratio": 1e-9}, "friction_field": {"slope": 1e-9}},
+        {"load_friction": {"exponent": 1e-9}, "static_kinetic": {"ratio": 1 + 1e-9}},
+        {"adhesion": {"force": 1e-6}},
+        {"grasp_slip": {"angle": 1e-9}, "floor_drift": {"drift": 1e-9}},
+        {"payload": {"weight": 1e-9}},
+        {"arm_friction": {"force": 1e-4}},
+    ],
+)
+def test_the_changed_world_with_a_tiny_effect_is_the_undisturbed_one(tiny):
+    commands = random_commands(1, 4)
+    scene = {"vertices": HOOK, "wall": 0.1}
+    assert np.allclose(follow(tiny, *commands, **scene), follow({}, *commands, **scene), atol=2e-3)
+
+
+def test_reset_starts_the_same_episode_again():
+    hidden = {
+        "static_kinetic": {"ratio": 1.4},
+        "floor_drift": {"drift": 0.003},
+        "grasp_slip": {"angle": 0.02, "at": 0.5},
+        "adhesion": {"force": 0.5},
+    }
+    truth = InjectedMujocoTruth(make_scene(HOOK), hidden, 4)
+    runs = []
+    for _ in range(2):
+        truth.reset(vector(0.0, 0.06, 0.0))
+        runs.append(torch.cat([torch.cat(truth.step(vector(*c))[:2]) for c in random_commands(2)]))
+    assert torch.equal(*runs)
+    with pytest.raises(NotImplementedError):
+        truth.step_from(vector(0.0, 0.06, 0.0), vector(0.0, 0.06, 0.0))
+
+
+PRESS_1, PRESS_2 = (0.0, 0.01, 0.0), (0.0, -0.03, 0.0)
+"""Commands 20 and 60 mm deep for the slab on the floor at zero."""
+
+
+def test_a_compliant_floor_sinks_by_compliance_times_load():
+    rows = follow({"floor_compliance": {"compliance": 2.5e-4}}, PRESS_1, PRESS_2, PRESS_1)
+    assert np.allclose(rows[:, 1], 0.03 - 2.5e-4 * rows[:, 4], atol=LENGTH)
+    assert rows[1, 4] == pytest.approx(6.0 / 1.025, abs=FORCE)
+
+
+def test_a_compliant_wall_gives_way_by_compliance_times_load():
+    press = [(0.10 + depth, 0.1, 0.0) for depth in (0.02, 0.05)]
+    rows = follow({"wall_compliance": {"compliance": 2.5e-4}}, *press, vertices=TOWER, wall=0.13)
+    assert np.allclose(rows[:, 0], 0.10 - 2.5e-4 * rows[:, 3], atol=LENGTH)
+    assert rows[1, 3] == pytest.approx(-5.0 / 1.025, abs=FORCE)
+
+
+def test_both_surfaces_give_way_along_their_tangent():
+    hidden = {"tangential_compliance": {"compliance": 5e-4}}
+    rows = follow(hidden, (0, -0.02, 0), (0.015, -0.02, 0))
+    assert rows[1, 3] == pytest.approx(-1.5 / 1.05, abs=FORCE)
+    assert rows[1, 0] == pytest.approx(5e-4 * 1.5 / 1.05, abs=LENGTH)
+    rows = follow(hidden, (0.15, 0.06, 0), (0.15, 0.075, 0), vertices=TOWER, wall=0.13)
+    assert rows[1, 1] == pytest.approx(0.06 + 5e-4 * 1.5 / 1.05, abs=LENGTH)
+
+
+def test_a_tilted_floor_rises_towards_x():
+    angle = 0.025
+    rows = follow(
+        {"floor_tilt": {"angle": angle}},
+        (0, 0.03, 0), (0.06, 0.03, 0), (-0.06, 0.03, 0),
+        vertices=WEDGE, friction=0.3, floor=0.01, start=(0, 0.08, 0),
+    )  # fmt: skip
+    points = np.array([lowest(WEDGE, row) for row in rows])
+    assert np.ptp(points[:, 0]) > 0.06
+    assert np.allclose(points[:, 1] - 0.01, points[:, 0] * math.tan(angle), atol=LENGTH)
+    # Friction relative to the tilted normal, sliding right.
+    along = rows[1, 3] * math.cos(angle) + rows[1, 4] * math.sin(angle)
+    across = -rows[1, 3] * math.sin(angle) + rows[1, 4] * math.cos(angle)
+    assert along / across == pytest.approx(-0.3, abs=2e-3)
+
+
+def test_a_tilted_wall_leans_left_as_it_rises():
+    angle = 0.05
+    spike = vector(0.05, 0.0, -0.04, 0.04, -0.04, -0.04).reshape(3, 2)
+    rows = follow(
+        {"wall_tilt": {"angle": angle}}, (0.13, 0.15, 0), (0.13, 0.20, 0), vertices=spike, wall=0.15
+    )
+    tips = [row[:2] + 0.05 * np.array([math.cos(row[2]), math.sin(row[2])]) for row in rows]
+    assert tips[1][1] - tips[0][1] > 0.01
+    for tip in tips:
+        assert tip[0] == pytest.approx(0.15 - tip[1] * math.tan(angle), abs=LENGTH)
+
+
+@pytest.mark.parametrize("curvature", [1.5, -1.5])
+def test_the_height_of_a_curved_floor_is_half_curvature_times_x_squared(curvature):
+    rows = follow(
+        {"floor_curvature": {"curvature": curvature}},
+        (0, 0.02, 0), (0.08, 0.02, 0), (-0.08, 0.02, 0), vertices=WEDGE,
+    )  # fmt: skip
+    points = np.array([lowest(WEDGE, row) for row in rows])
+    assert np.abs(points[1:, 0]).min() > 0.04
+    assert np.allclose(points[:, 1], curvature * points[:, 0] ** 2 / 2, atol=LENGTH)
+
+
+def test_a_flat_object_rests_on_the_top_of_a_hill_and_spans_a_hollow():
+    hill, hollow = (
+        follow({"floor_curvature": {"curvature": curvature}}, PRESS_1)[0] for curvature in (-2, 2)
+    )
+    assert hill[1] == pytest.approx(0.03, abs=LENGTH)
+    assert hollow[1] == pytest.approx(0.03 + 0.05**2, abs=LENGTH)
+
+
+def test_a_step_in_the_floor_lifts_what_passes_it():
+    rows = follow(
+        {"floor_step": {"height": 0.002, "x": 0.02}},
+        (0, 0.03, 0), (0.06, 0.03, 0), (-0.04, 0.03, 0), vertices=WEDGE, friction=0.2,
+    )  # fmt: skip
+    heights = [lowest(WEDGE, row)[1] for row in rows]
+    assert np.allclose(heights, [0.0, 0.002, 0.0], atol=LENGTH)
+
+
+def slide_ratios(hidden, depth=0.05, **scene) -> list[float]:
+    """F_t / F_n on the floor after sliding right and left."""
+    z = 0.03 - depth
+    rows = follow(hidden, (0, z, 0), (0.07, z, 0), (-0.07, z, 0), **scene)
+    return (rows[1:, 3] / rows[1:, 4]).tolist()
+
+
+def wall_ratios(hidden) -> list[float]:
+    """F_t / F_n on the wall after sliding up and down."""
+    rows = follow(
+        hidden, (0.13, 0.15, 0), (0.13, 0.20, 0), (0.13, 0.10, 0), vertices=TOWER, wall=0.13
+    )
+    return (-rows[1:, 4] / rows[1:, 3]).tolist()
+
+
+def test_the_wall_has_a_friction_of_its_own():
+    hidden = {"wall_friction": {"log_ratio": -0.6}}
+    assert slide_ratios(hidden) == pytest.approx([-NOMINAL, NOMINAL], abs=2e-3)
+    own = NOMINAL * math.exp(-0.6)
+    assert wall_ratios(hidden) == pytest.approx([-own, own], abs=2e-3)
+
+
+def test_friction_depends_on_the_direction_of_the_slide():
+    hidden = {"directional_friction": {"log_ratio": 0.3}}
+    more, less = NOMINAL * math.exp(0.3), NOMINAL * math.exp(-0.3)
+    assert slide_ratios(hidden) == pytest.approx([-more, less], abs=2e-3)
+    assert wall_ratios(hidden) == pytest.approx([-more, less], abs=2e-3)
+
+
+def test_static_friction_holds_more_than_a_slide_and_returns_after_rest():
+    hidden = {"static_kinetic": {"ratio": 1.5}}
+    hold = (0.028, -0.02, 0)  # 2.8 N at a load of 5 N: within 0.6, beyond 0.4
+    rows = follow(hidden, (0, -0.02, 0), hold, (0.06, -0.02, 0), (0.068, -0.02, 0))
+    assert abs(rows[1, 0]) < LENGTH and rows[1, 3] == pytest.approx(-2.8, abs=FORCE)
+    assert rows[2, 3:5] == pytest.approx([-2.0, 5.0], abs=2 * FORCE)
+    assert rows[3, 0] == pytest.approx(rows[2, 0], abs=LENGTH)
+    assert rows[3, 3] == pytest.approx(-2.8, abs=2 * FORCE)
+
+
+def test_friction_is_a_power_of_the_load():
+    hidden = {"load_friction": {"exponent": -0.3}}
+    for depth in (0.015, 0.03, 0.06):
+        expected = NOMINAL * (depth * 100 / 3) ** -0.3
+        assert slide_ratios(hidden, depth) == pytest.approx([-expected, expected], abs=4e-3)
+
+
+def test_friction_varies_along_the_floor():
+    rows = follow(
+        {"friction_field": {"slope": 4.0}},
+        (0, 0.02, 0), (0.08, 0.02, 0), (-0.08, 0.02, 0), vertices=WEDGE,
+    )  # fmt: skip
+    for row, sign in zip(rows[1:], (-1, 1), strict=True):
+        expected = sign * NOMINAL * (1 + 4.0 * lowest(WEDGE, row)[0])
+        assert row[3] / row[4] == pytest.approx(expected, abs=2e-3)
+
+
+def test_adhesion_holds_until_it_is_pulled_harder():
+    rows = follow({"adhesion": {"force": 1.0}}, PRESS_1, (0, 0.039, 0), (0, 0.042, 0), PRESS_1)
+    assert rows[[0, 3], 1] == pytest.approx(0.03, abs=LENGTH)
+    assert rows[[0, 3], 4] == pytest.approx(2.0, abs=FORCE)
+    assert rows[1, [1, 4]] == pytest.approx([0.03, -0.9], abs=FORCE)
+    assert rows[2, [1, 4]] == pytest.approx([0.042, 0.0], abs=FORCE)
+
+
+def test_adhesion_adds_to_the_compression_that_friction_sees():
+    rows = follow({"adhesion": {"force": 1.0}}, (0, -0.02, 0), (0.06, -0.02, 0))
+    assert rows[1, 3:5] == pytest.approx([-NOMINAL * 6.0, 5.0], abs=FORCE)
+
+
+def test_the_true_stiffness_makes_the_forces():
+    hidden = {"stiffness_error": {"log_ratio_x": 0.1, "log_ratio_z": -0.08}}
+    free, pressed, slid = follow(hidden, (0.01, 0.05, 0), (0.01, 0.0, 0), (0.018, 0.0, 0))
+    assert free == pytest.approx([0.01, 0.05, 0, 0, 0, 0], abs=1e-3)
+    assert pressed[4] == pytest.approx(3.0 * math.exp(-0.08), abs=FORCE)
+    assert slid[3] == pytest.approx(-0.8 * math.exp(0.1), abs=FORCE)
+
+
+def test_a_payload_makes_the_free_arm_sag_and_turn():
+    hidden = {"payload": {"weight": 1.2, "lever": 0.05}}
+    free, pressed = follow(hidden, (0.0, 0.08, 0.1), (0, -0.02, 0))
+    torque = -1.2 * 0.05 * math.cos(free[2])
+    assert free[3:] == pytest.approx([0.0, -1.2, torque], abs=FORCE)
+    assert free[:3] == pytest.approx([0.0, 0.08 - 0.012, 0.1 + torque / 50], abs=LENGTH)
+    assert pressed[[1, 4]] == pytest.approx([0.03, 5.0], abs=FORCE)
+
+
+def test_a_lagging_controller_stops_a_share_of_the_last_step_short():
+    first, second, pause = follow(
+        {"command_lag": {"share": 0.2}}, (0.01, 0.07, 0.1), (0.03, 0.05, -0.1), (0.03, 0.05, -0.1)
+    )
+    assert first == pytest.approx([0.008, 0.068, 0.08, 0, 0, 0], abs=1e-3)
+    assert second == pytest.approx([0.026, 0.054, -0.06, 0, 0, 0], abs=1e-3)
+    assert pause == pytest.approx([0.03, 0.05, -0.1, 0, 0, 0], abs=1e-3)
+
+
+def test_dry_friction_of_the_arm_stops_it_short_and_is_not_measured():
+    hidden = {"arm_friction": {"force": 0.3}}
+    right, pause, left, pressed = follow(
+        hidden, (0.02, 0.06, 0), (0.02, 0.06, 0), (-0.02, 0.08, 0), (-0.02, -0.02, 0)
+    )
+    assert right == pytest.approx([0.017, 0.06, 0, 0, 0, 0], abs=1e-4)
+    assert pause == pytest.approx(right, abs=2e-5)
+    assert left == pytest.approx([-0.017, 0.077, 0, 0, 0, 0], abs=1e-4)
+    assert pressed[[1, 4]] == pytest.approx([0.03, 4.7], abs=FORCE)
+
+
+def test_a_compliant_grasp_turns_by_compliance_times_torque():
+    rows = follow(
+        {"grasp_compliance": {"compliance": 0.1}}, (0, 0.02, 0), (0, -0.01, 0), vertices=HOOK
+    )
+    for row in rows:
+        corner = lowest(HOOK, row, turn=0.1 * row[5])
+        assert corner[1] == pytest.approx(0.0, abs=LENGTH)
+        arm = corner - row[:2]
+        assert row[5] == pytest.approx(arm[0] * row[4] - arm[1] * row[3], abs=1e-3)
+        assert abs(lowest(HOOK, row)[1]) > 4e-4
+
+
+def test_the_grasp_slips_at_its_row_and_not_before():
+    hidden = {"grasp_slip": {"angle": 0.03, "shift": 0.002, "at": 0.5}}
+    press = (0.0, 0.02, 0.0)
+    rows = follow(hidden, *[press] * 4, vertices=HOOK)
+    assert lowest(HOOK, rows[0])[1] == pytest.approx(0.0, abs=LENGTH)
+    for row in rows[1:]:
+        corner = lowest(HOOK, row, turn=0.03, shift=0.002)
+        assert corner[1] == pytest.approx(0.0, abs=LENGTH)
+        arm = corner - row[:2]
+        assert row[5] == pytest.approx(arm[0] * row[4] - arm[1] * row[3], abs=1e-3)
+
+
+def test_the_floor_drifts_with_the_row():
+    rows = follow({"floor_drift": {"drift": 0.003}}, *[PRESS_1] * 4, floor=-0.01, steps=5)
+    assert np.allclose(rows[:, 1], 0.02 + 0.003 * np.arange(1, 5) / 5, atol=LENGTH)
+
+
+def test_several_effects_act_together():
+    rows = follow(
+        {
+            "floor_compliance": {"compliance": 2e-4},
+            "stiffness_error": {"log_ratio_z": 0.1},
+            "floor_drift": {"drift": 0.004},
+            "directional_friction": {"log_ratio": 0.2},
+        },
+        (0, -0.02, 0), (0.07, -0.02, 0),
+    )  # fmt: skip
+    stiffness = 100 * math.exp(0.1)
+    for row, height in zip(rows, (0.002, 0.004), strict=True):
+        load = stiffness * (0.05 + height) / (1 + stiffness * 2e-4)
+        assert row[4] == pytest.approx(load, abs=FORCE)
+        assert row[1] == pytest.approx(0.03 + height - 2e-4 * load, abs=LENGTH)
+    assert rows[1, 3] / rows[1, 4] == pytest.approx(-NOMINAL * math.exp(0.2), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "expected"),
+    [
+        ({}, (2.0, 4.0, 0.3)),
+        ({"force_bias": {"F_x": 0.6, "F_z": -0.9, "tau": 0.03}}, (2.6, 3.1, 0.33)),
+        ({"force_drift": {"F_x": 1.0, "F_z": -1.2}}, (2.5, 3.4, 0.3)),
+        ({"force_gain": {"gain": 0.1}}, (2.2, 4.4, 0.33)),
+        ({"sensor_rotation": {"angle": math.pi / 2}}, (-4.0, 2.0, 0.3)),
+        (
+            {"wrench_reference_point": {"x": 0.01, "z": 0.02}},
+            (2.0, 4.0, 0.3 - (0.01 * 4.0 - 0.02 * 2.0)),
+        ),
+        (
+            {"sensor_rotation": {"angle": math.pi / 2}, "force_bias": {"F_x": 1.0}},
+            (-3.0, 2.0, 0.3),
+        ),
+    ],
+)
+def test_a_wrong_sensor_reports(hidden, expected):
+    pose, wrench = vector(0.1, 0.2, 0.3), vector(2.0, 4.0, 0.3)
+    reported = sensor_effects(hidden, pose, wrench, 0.5)
+    assert torch.equal(reported[0], pose)
+    assert reported[1].tolist() == pytest.approx(expected)
+    assert wrench.tolist() == [2.0, 4.0, 0.3]
+
+
+def test_the_truth_reports_what_its_sensor_does():
+    hidden = {"force_gain": {"gain": 0.1}, "force_drift": {"F_z": 1.0}}
+    truth = InjectedMujocoTruth(make_scene(), hidden, 4)
+    for row in range(1, 4):
+        _, wrench, _ = truth.step(vector(*PRESS_1))
+        assert float(wrench[1]) == pytest.approx(2.0 * 1.1 + row / 4, abs=FORCE)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "message"),
+    [
+        ({"flor_tilt": {"angle": 0.1}}, "unknown effect 'flor_tilt', known are floor_compliance"),
+        ({"floor_tilt": {"slope": 0.1}}, "floor_tilt has no parameter 'slope', expected angle"),
+        ({"adhesion": {"force": -1.0}}, "force of adhesion is -1.0, expected finite, >= 0"),
+        ({"static_kinetic": {"ratio": 0.5}}, "expected finite, >= 1"),
+        ({"payload": {"weight": math.nan}}, "weight of payload is nan"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(hidden, message):
+    with pytest.raises(ValueError, match=message) as raised:
+        InjectedMujocoTruth(make_scene(), hidden, 4)
+    assert "\n" not in str(raised.value)
+    with pytest.raises(ValueError, match="steps is 0"):
+        InjectedMujocoTruth(make_scene(), {}, 0)
+
+
+def test_every_effect_of_the_catalogue_settles_in_contact_with_floor_and_wall():
+    sizes = {"curvature": 0.5, "ratio": 1.4, "compliance": 2e-4, "force": 0.3, "height": 0.002}
+    sizes |= {"shift": 0.002, "angle": 0.03}
+    corner = ((0.07, 0.02, 0.0), (0.12, 0.02, 0.0), (0.12, 0.06, 0.1), (0.12, 0.01, -0.1))
+    for name, form in FORMS.items():
+        hidden = {name: {size: sizes.get(size, 0.05) for size in form.sizes}}
+        scene = make_scene(HOOK, wall=0.12)
+        truth = InjectedMujocoTruth(scene, hidden, len(corner))
+        for command in corner:
+            pose, wrench, settled = truth.step(vector(*command))
+            assert settled, name
+            assert bool(torch.isfinite(pose).all() and torch.isfinite(wrench).all())

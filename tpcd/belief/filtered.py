@@ -1,0 +1,133 @@
+"""The filter over a history in plain torch, and what any engine answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tpcd.belief.kalman import Innovation, assimilate, first_state, parted
+from tpcd.belief.misfit import MisfitField, misfit_rows
+from tpcd.belief.setting import Setting
+from tpcd.contact import ContactScene
+from tpcd.effects.conditions import angle_difference
+from tpcd.simulator import StepSettings, StepStatus, simulate_step
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How the n transitions of m particles settled; zero where one was not stepped."""
+
+    pose: Float[Tensor, "m n 3"]
+    mode: Int[Tensor, "m n t"]
+    contacts: Float[Tensor, "m n t 4"]
+    """As in `Transition`."""
+
+
+@dataclass(frozen=True)
+class HistoryLikelihood:
+    """What theta says about a history, m particles.
+
+    `total` is the log likelihood, -inf for a particle that was given up; `field_mean` and
+    `field_covariance` are the normal posterior of the misfit coefficients. Where they are asked
+    for, `whitened` and `log_scale` are the innovations of the n transitions (see
+    `kalman.Innovation`), NaN without one, and `slopes` the derivatives of `whitened` by d
+    coordinates; `steps` how the transitions settled.
+    """
+
+    total: Float[Tensor, " m"]
+    field_mean: Float[Tensor, "m c"]
+    field_covariance: Float[Tensor, "m c c"]
+    whitened: Float[Tensor, "m n 3"] | None = None
+    log_scale: Float[Tensor, "m n 3"] | None = None
+    slopes: Float[Tensor, "m d n 3"] | None = None
+    steps: Steps | None = None
+
+
+def filter_history(
+    points_ee: Float[Tensor, "m p 2"],
+    setting: Setting,
+    misfit_sd: Float[Tensor, " m"],
+    field: MisfitField,
+    settings: StepSettings,
+    innovations: bool = False,
+    steps: bool = False,
+) -> HistoryLikelihood:
+    """Step and filter all transitions that count, for outlines in the end-effector frame [m]."""
+    finite = torch.isfinite(misfit_sd)
+    sd = torch.where(finite, misfit_sd, 0.0)
+    conditions, merged = setting.conditions, setting.merged
+    m, n, terrains = len(sd), len(setting.used), conditions.offset.shape[-1]
+    scene = conditions.scene(points_ee[:, None])
+    count = field.bumps * terrains
+    state = first_state(sd, count, merged.variance[:, 0])
+    total = torch.zeros_like(misfit_sd)
+    blank = Innovation(*(sd.new_full((m, 3), torch.nan) for _ in range(2)))
+    each: list[Innovation] = []
+    settled: list[tuple[Tensor, Tensor, Tensor]] = []
+    nothing = (
+        sd.new_zeros(m, 3),
+        torch.zeros(m, terrains, dtype=torch.long),
+        sd.new_zeros(m, terrains, 4),
+    )
+    for k in range(n):
+        variance = merged.variance[:, k + 1]
+        if not setting.used[k]:
+            state = parted(state, count, variance)
+            each.append(blank)
+            settled.append(nothing)
+            continue
+        begins, ends = (_turn(conditions.turn, row) for row in (k, k + 1))
+        transition = simulate_step(
+            _column(scene, k + 1),
+            merged.poses[:, k] - state.mean[:, count:] + begins,
+            _row(conditions.target, k + 1) + ends,
+            _row(conditions.stiffness, k + 1),
+            settings,
+            previous=_row(conditions.target, k) + begins,
+        )
+        pose = transition.pose - ends
+        residual = angle_difference(merged.poses[:, k + 1] - _row(conditions.give, k + 1), pose)
+        # As in compiled loops, one angle tells which bumps act.
+        angle = merged.poses[0, k + 1, 2]
+        rows, uncovered = misfit_rows(field, sd, angle, transition)
+        usable = (transition.status <= int(StepStatus.RELAXED)) & finite
+        usable = usable & torch.isfinite(residual).all(-1)
+        # What is not usable must not reach a factorisation.
+        parts = (residual, rows, transition.pose_from_start, uncovered)
+        residual, rows, from_start, uncovered = (
+            torch.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in parts
+        )
+        state, found = assimilate(state, residual, rows, from_start, variance, uncovered)
+        total = total + torch.where(usable, found.log_density, -torch.inf)
+        parts = (found.whitened, found.log_scale)
+        each.append(Innovation(*(torch.where(usable[:, None], p, torch.nan) for p in parts)))
+        settled.append((pose, transition.mode, transition.contacts))
+    mean, covariance = state.mean[:, :count], state.covariance[:, :count, :count]
+    whitened = log_scale = None
+    if innovations:
+        whitened = torch.stack([one.whitened for one in each], dim=1)
+        log_scale = torch.stack([one.log_scale for one in each], dim=1)
+    found_steps = None
+    if steps:
+        found_steps = Steps(*(torch.stack(part, 1) for part in zip(*settled, strict=True)))
+    return HistoryLikelihood(total, mean, covariance, whitened, log_scale, steps=found_steps)
+
+
+def _column(scene: ContactScene, row: int) -> ContactScene:
+    """The scenes (m) at a row of the batch (m, r)."""
+    count = scene.batch_shape[0]
+    return scene.columns(torch.tensor([row])).gather(torch.arange(count))
+
+
+def _row(value: Tensor, row: int) -> Tensor:
+    """The value (m, 3) at a row of (m, r, 3), where r may be 1."""
+    return value[:, row if value.shape[1] > 1 else 0]
+
+
+def _turn(turn: Tensor, row: int) -> Tensor:
+    """The turn at a row as a change of pose (m, 3)."""
+    angle = _row(turn, row)
+    return torch.cat((angle.new_zeros(len(angle), 2), angle), dim=-1)

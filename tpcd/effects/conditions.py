@@ -1,0 +1,153 @@
+"""What the arm is asked, what it meets and how it is read, row by row: where effects act.
+
+A row is a command and what is measured once the arm has settled after it; a transition goes
+over to a row from the one before. The base model fills `Conditions` from theta, and effects
+change them. Fields have the axes (m, r, ...) of particles and rows, of which each may be 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tpcd.contact import ContactScene
+from tpcd.planar import wrap_angle
+from tpcd.terrain import HalfPlane, floor, wall
+
+FLOOR, WALL = 0, 1
+"""Positions of the terrains."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What is known of r rows before anything is simulated."""
+
+    follows: Int[Tensor, " r"]
+    """The row that each one comes after; a first row comes after itself."""
+    share: Float[Tensor, " r"]
+    """How much of the run has passed, from 0 to 1."""
+    starts: Float[Tensor, "r 3"]
+    """Measured pose at the start of each row's transition, the end of the row it follows
+    [m, m, rad]."""
+
+    def before(self, value: Float[Tensor, "m s *rest"]) -> Float[Tensor, "m s *rest"]:
+        """The value at the row that each row follows."""
+        return value if value.shape[1] == 1 else value[:, self.follows]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the rows settle under the conditions of the pass before."""
+
+    pose: Float[Tensor, "m r 3"]
+    """Settled pose [m, m, rad]; where a row follows no other, its start."""
+    mode: Int[Tensor, "m r t"]
+    """`ContactMode` against each terrain."""
+    load: Float[Tensor, "m r t"]
+    """Normal force of each terrain [N]."""
+    drag: Float[Tensor, "m r t"]
+    """Tangential force of each terrain on the object, along the terrain's tangent [N]."""
+    arm: Float[Tensor, "m r t 2"]
+    """From the end effector to the contact point, in world axes [m]."""
+
+    @property
+    def place(self) -> Float[Tensor, "m r t 2"]:
+        """Contact point in the world [m]."""
+        return self.pose[:, :, None, :2] + self.arm
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Everything that effects can change; world axes, SI units."""
+
+    command: Float[Tensor, "#m #r 3"]
+    """Pose that the controller pursues [m, m, rad]."""
+    stiffness: Float[Tensor, "#m #r 3"]
+    """Diagonal of the controller's true stiffness [N/m, N/m, N·m/rad]."""
+    load: Float[Tensor, "#m #r 3"]
+    """Wrench on the arm that is not of contact but is measured [N, N, N·m]."""
+    pull: Float[Tensor, "#m #r 3"]
+    """Wrench on the object at its contacts besides their normal forces and friction."""
+    turn: Float[Tensor, "#m #r 1"]
+    """Angle of the object in the hand besides its mount [rad]."""
+    normal: Float[Tensor, "#m #r t 2"]
+    """Outward unit normals of the terrains."""
+    offset: Float[Tensor, "#m #r t"]
+    """Planes n·p = offset [m]."""
+    friction: Float[Tensor, "#m #r t"]
+    """Coulomb coefficients."""
+    give: Float[Tensor, "#m #r 3"]
+    """Added to the settled pose [m, m, rad]."""
+    sensor: Float[Tensor, "#m #r 3 3"]
+    """Matrix by which the true wrench is read."""
+    bias: Float[Tensor, "#m #r 3"]
+    """Added to the wrench that is read [N, N, N·m]."""
+
+    @property
+    def target(self) -> Float[Tensor, "#m #r 3"]:
+        """Command at which the arm, without other loads, feels the same contact."""
+        return self.command + (self.load + self.pull) / self.stiffness
+
+    def scene(self, points_ee: Float[Tensor, "m 1 p 2"]) -> ContactScene:
+        """Outlines and planes as a scene of batch (m, r), or (m, 1) where rows are alike."""
+        each = torch.broadcast_shapes(
+            self.normal.shape[:3], self.offset.shape, self.friction.shape, (len(points_ee), 1, 1)
+        )
+        normals, offsets = self.normal.expand(*each, 2), self.offset.expand(each)
+        planes = zip(normals.unbind(2), offsets.unbind(2), strict=True)
+        return ContactScene(
+            points_ee, tuple(HalfPlane(*plane) for plane in planes), self.friction.expand(each)
+        )
+
+
+def base_conditions(
+    scene: ContactScene, commands: Float[Tensor, "r 3"], stiffness: Float[Tensor, " 3"]
+) -> Conditions:
+    """The conditions without any effect; the scene has the batch axis of m particles."""
+    planes = [body for body in scene.terrains if isinstance(body, HalfPlane)]
+    return replace(
+        bare_conditions(commands, stiffness),
+        normal=torch.stack([p.direction for p in planes], -2)[:, None],
+        offset=torch.stack([p.offset for p in planes], -1)[:, None],
+        friction=scene.friction[:, None],
+    )
+
+
+def bare_conditions(commands: Float[Tensor, "r 3"], stiffness: Float[Tensor, " 3"]) -> Conditions:
+    """The conditions of an arm whose terrains are unknown, put at the origin."""
+    zero = commands.new_zeros(1, 1, 3)
+    terrains = (floor(zero[..., 0]), wall(zero[..., 0]))
+    return Conditions(
+        command=commands[None],
+        stiffness=stiffness[None, None],
+        load=zero,
+        pull=zero,
+        turn=zero[..., :1],
+        normal=torch.stack([plane.direction for plane in terrains], -2),
+        offset=zero[..., :2],
+        friction=zero[..., :2],
+        give=zero,
+        sensor=torch.eye(3, dtype=commands.dtype)[None, None],
+        bias=zero,
+    )
+
+
+def sequence(poses: Float[Tensor, "r 3"], follows: Int[Tensor, " r"] | None = None) -> Rows:
+    """Rows one after the other, as in an episode; a run begins where a row follows itself."""
+    count = len(poses)
+    if follows is None:
+        follows = (torch.arange(count) - 1).clamp_min(0)
+    place = torch.arange(count)
+    begins = torch.where(follows == place, place, 0).cummax(0).values
+    sizes = begins.bincount(minlength=count)[begins]
+    share = (place - begins) / (sizes - 1).clamp_min(1)
+    return Rows(follows, share.double(), poses[follows])
+
+
+def angle_difference(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3"]:
+    """Pose a minus pose b, the angle the short way round."""
+    offset = a - b
+    return torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)

@@ -42,8 +42,9 @@ class Simulation:
     """Folder for the episodes NAME.csv, NAME.yaml and their NAME.truth.csv, .truth.yaml."""
     truth: Literal["quasistatic", "mujoco"] = "mujoco"
     """Who decides what happens: the project's own model, or MuJoCo independent of it."""
-    policy: Literal["rich", "press_and_slide", "test"] = "rich"
-    """Motion: touch-driven exploration, the paper's basic one, or a smooth test trajectory."""
+    policy: Literal["rich", "press_and_slide", "diagnosis", "test"] = "rich"
+    """Motion: touch-driven exploration, the paper's basic one, one that excites the effects
+    which a diagnosis looks for, or a smooth test trajectory."""
     steps: int = 15
     """Commands after the start pose of each episode."""
     episodes: int = 1

@@ -38,6 +38,10 @@ class CheckpointError(FileError):
     """A prior checkpoint that is missing, corrupt, or of another format version."""
 
 
+class ModelError(FileError):
+    """A model file, or a file of effects, that is missing or malformed."""
+
+
 class RunError(FileError):
     """A run folder that is missing, incomplete, or would be overwritten."""
 

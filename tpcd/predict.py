@@ -19,6 +19,8 @@ from tpcd.belief.belief import Belief
 from tpcd.belief.misfit import misfit_rows
 from tpcd.belief.resampling import systematic_resample
 from tpcd.contact import ContactScene, column_scene, scene_from_parameters
+from tpcd.effects.conditions import Rows, sequence
+from tpcd.effects.simulate import SimulatedRows, simulate_rows
 from tpcd.planar import wrap_angle
 from tpcd.simulator import StepStatus, simulate_step
 
@@ -48,6 +50,10 @@ class Prediction:
     """Whether any particle gave an answer; where not, everything else is NaN."""
     sensor_variance: Float[Tensor, " 6"]
     """Variance of the sensor noise that is part of the prediction."""
+    component_wrench: Float[Tensor, "m n 3"] | None = None
+    """Wrench given the particle; None where it is K (x' - u)."""
+    wrench_matrix: Float[Tensor, "m n 3 3"] | None = None
+    """How that wrench answers the settled pose; None where by K."""
 
     @property
     def component_variance(self) -> Float[Tensor, "m n 3"]:
@@ -57,17 +63,15 @@ class Prediction:
     @property
     def mean(self) -> Float[Tensor, "n 6"]:
         """Mean of pose and wrench."""
-        pose = (self.weights[..., None] * self.component_mean).sum(0)
-        return self._with_wrench(pose)
+        mean, _ = self._components()
+        return (self.weights[..., None] * mean).sum(0)
 
     @property
     def std(self) -> Float[Tensor, "n 6"]:
         """Standard deviation of pose and wrench."""
-        centre = (self.weights[..., None] * self.component_mean).sum(0)
-        square = self.component_variance + (self.component_mean - centre) ** 2
-        pose = (self.weights[..., None] * square).sum(0)
-        variance = torch.cat((pose, pose * self.stiffness**2), dim=-1) + self.sensor_variance
-        return variance.sqrt()
+        mean, std = self._components()
+        square = std**2 + (mean - self.mean) ** 2
+        return (self.weights[..., None] * square).sum(0).sqrt()
 
     @property
     def mode_probability(self) -> Float[Tensor, "n t 4"]:
@@ -106,23 +110,29 @@ class Prediction:
         weights = torch.where(self.answered, self.weights, 1.0 / len(self.weights))
         chosen = torch.multinomial(weights.T, count, replacement=True, generator=generator).T
         columns = torch.arange(chosen.shape[1])
-        mean = self.component_mean[chosen, columns]
+        mean = self._components()[0][chosen, columns]
         factor = torch.linalg.cholesky(self.component_covariance[chosen, columns])
-        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
-        draws = self._with_wrench(mean + (factor @ noise[..., None])[..., 0])
+        noise = torch.randn(*mean.shape[:-1], 3, generator=generator, dtype=mean.dtype)
+        moved = factor @ noise[..., None]
+        matrix = self._matrix().expand(*self.weights.shape, 3, 3)[chosen, columns]
+        draws = mean + torch.cat((moved, matrix @ moved), dim=-2)[..., 0]
         sensor = torch.randn(draws.shape, generator=generator, dtype=mean.dtype)
         return draws + sensor * self.sensor_variance.sqrt()
 
     def _components(self) -> tuple[Tensor, Tensor]:
-        mean = self._with_wrench(self.component_mean)
-        variance = self.component_variance
-        variance = torch.cat((variance, variance * self.stiffness**2), dim=-1)
+        wrench = self.component_wrench
+        if wrench is None:
+            offset = self.component_mean - self.command
+            offset = torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)
+            wrench = self.stiffness * offset
+        matrix, covariance = self._matrix(), self.component_covariance
+        spread = ((matrix @ covariance) * matrix).sum(-1)
+        variance = torch.cat((self.component_variance, spread), dim=-1)
+        mean = torch.cat((self.component_mean, wrench), dim=-1)
         return mean, (variance + self.sensor_variance).sqrt()
 
-    def _with_wrench(self, pose: Tensor) -> Tensor:
-        offset = pose - self.command
-        offset = torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)
-        return torch.cat((pose, self.stiffness * offset), dim=-1)
+    def _matrix(self) -> Tensor:
+        return torch.diag(self.stiffness) if self.wrench_matrix is None else self.wrench_matrix
 
 
 class ContactPredictor:
@@ -147,6 +157,8 @@ class ContactPredictor:
         parameters = belief.prior.parameters_of(belief.vectors[keep])
         with torch.no_grad():
             scene = scene_from_parameters(belief.prior.shape, parameters)
+        self._flat = scene
+        self._added = belief.prior.added_of(belief.vectors[keep])
         self._scene: ContactScene = column_scene(scene)
         self._field_sd = belief.misfit_sd[keep]
         self._field_mean = belief.misfit_mean[keep]
@@ -170,14 +182,21 @@ class ContactPredictor:
         without, of what will truly be.
         """
         start_variance = pose.new_zeros(3) if pose_std is None else pose_std.double() ** 2
-        transition = simulate_step(
-            self._scene,
-            pose.double(),
-            command.double(),
-            self.belief.stiffness,
-            self.belief.step,
-            previous=None if previous is None else previous.double(),
-        )
+        pose, command = pose.double(), command.double()
+        previous = None if previous is None else previous.double()
+        found = None
+        if self._added.effects:
+            found = self._with_effects(pose, command, previous)
+            transition = found.transition
+        else:
+            transition = simulate_step(
+                self._scene,
+                pose,
+                command,
+                self.belief.stiffness,
+                self.belief.step,
+                previous=previous,
+            )
         settled = transition.pose
         # Angles are averaged near the command, the short way round.
         turn = command[:, 2:] + wrap_angle(settled[..., 2:] - command[:, 2:])
@@ -199,10 +218,16 @@ class ContactPredictor:
         answered = total > 0
         share = weights / torch.where(answered, total, math.nan)
         keep = usable[..., None]
+        wrench = None
+        if found is not None:
+            moved = settled - transition.pose
+            moved = torch.cat((moved[..., :2], wrap_angle(moved[..., 2:])), dim=-1)
+            wrench = found.wrench + (found.matrix @ moved[..., None])[..., 0]
+            wrench = torch.where(keep, wrench, 0.0)
         identity = torch.eye(3, dtype=torch.float64)
         sensor = pose.new_zeros(6) if sensor_std is None else sensor_std.double() ** 2
         return Prediction(
-            command=command.double(),
+            command=command,
             stiffness=self.belief.stiffness,
             weights=share,
             component_mean=torch.where(keep, settled, 0.0),
@@ -210,6 +235,27 @@ class ContactPredictor:
             component_mode=transition.mode,
             answered=answered,
             sensor_variance=sensor.double(),
+            component_wrench=wrench,
+            wrench_matrix=None if found is None else found.matrix,
+        )
+
+    def _with_effects(
+        self, pose: Tensor, command: Tensor, previous: Tensor | None
+    ) -> SimulatedRows:
+        """The transitions as rows: of a run where they follow each other, else in pairs."""
+        before = pose if previous is None else previous
+        if torch.equal(before[1:], command[:-1]):
+            rows, commands = (
+                sequence(torch.cat((pose, pose[-1:]))),
+                torch.cat((before[:1], command)),
+            )
+        else:
+            commands = torch.stack((before, command), dim=1).flatten(0, 1)
+            first = torch.arange(len(command)).repeat_interleave(2) * 2
+            starts = pose.repeat_interleave(2, dim=0)
+            rows = Rows(first, torch.ones(len(commands), dtype=torch.float64), starts)
+        return simulate_rows(
+            self._flat, rows, commands, self.belief.stiffness, self._added, self.belief.step
         )
 
     def rollout(
@@ -222,8 +268,13 @@ class ContactPredictor:
     ) -> Float[Tensor, "samples n 6"]:
         """Draw whole trajectories: every particle follows its own poses, n steps long.
 
-        Each trajectory keeps one theta and one draw of its misfit field throughout.
+        Each trajectory keeps one theta and one draw of its misfit field throughout. Raises
+        ValueError for a belief with effects, whose rollouts are not there yet.
         """
+        if self._added.effects:
+            raise ValueError(
+                "a belief with effects predicts one step at a time only; leave --rollout out"
+            )
         chosen = torch.multinomial(self.weights, samples, replacement=True, generator=generator)
         scene = self._scene.gather(chosen)
         field = self._field_mean[chosen]

@@ -133,7 +133,7 @@ def estimate(
         started = time.perf_counter()
         target = target.given(history.first(k))
         cloud, info = assimilate(cloud, target, k, settings.sampler, generator)
-        belief = _belief(cloud, target)
+        belief = belief_of(cloud, target)
         seconds = time.perf_counter() - started
         after = EstimatorState(k, cloud_to_tensors(cloud), generator.get_state())
         yield EstimationStep(k, belief, info, seconds, after)
@@ -195,7 +195,8 @@ def weighted_quantile(
     return ordered.gather(0, first[None])[0]
 
 
-def _belief(cloud: Cloud, target: ContactTarget) -> Belief:
+def belief_of(cloud: Cloud, target: ContactTarget) -> Belief:
+    """The belief that weighted particles stand for, given the history of the target."""
     assert target.history is not None
     found = target.evaluate(cloud.positions)
     return Belief(

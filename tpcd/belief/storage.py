@@ -20,6 +20,7 @@ from safetensors.torch import save as save_tensors
 from tpcd.belief.belief import Belief
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
+from tpcd.effects.model import effects_from_plain, effects_to_plain
 from tpcd.errors import RunError
 from tpcd.results import read_json, write_json
 from tpcd.shape.checkpoint import find_prior, load_prior
@@ -47,6 +48,7 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
             "format_version": FORMAT_VERSION,
             "names": list(belief.prior.names),
             "units": list(belief.prior.units),
+            "effects": effects_to_plain(belief.prior.effects),
             "prior": str(prior),
             "prior_sha256": prior_hash(prior),
             "misfit": asdict(belief.misfit),
@@ -74,6 +76,7 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     try:
         prior, weights = card["prior"], card["prior_sha256"]
         misfit, step = MisfitField(**card["misfit"]), StepSettings(**card["step"])
+        effects = effects_from_plain(card.get("effects", []), path)
         # JSON has no NaN: the filter `paper` estimates no evidence.
         evidence = {
             name: math.nan if card[name] is None else float(card[name])
@@ -95,7 +98,7 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise RunError(data, f"cannot be read ({error})", "estimate again") from error
     return Belief(
-        prior=ParameterPrior(shape, values.pop("low"), values.pop("high")),
+        prior=ParameterPrior(shape, values.pop("low"), values.pop("high"), effects),
         misfit=misfit,
         step=step,
         log_evidence=evidence["log_evidence"],

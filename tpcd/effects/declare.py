@@ -25,6 +25,8 @@ class DeclaredEffect:
     text: str
     needs: tuple[str, ...] = ()
     passes: int = 0
+    source: str = ""
+    """File that it was read from; empty for the catalogue."""
 
     def __post_init__(self) -> None:
         """Refuse a site that is not one."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -48,8 +49,9 @@ __all__ = ["InjectedMujocoTruth", "sensor_effects"]
 MOVING_TIME = 0.25
 """Time in which a floor drifts or an object slips, before the command moves [s]; what then
 would penetrate is pushed out at a few mm/s."""
-
-
+DRY_HOLD_TIME = 60.0
+"""Longest hold of an arm with dry friction [s]: where contact blocks an axis that friction
+holds as well, the load moves slowly from one to the other."""
 UPDATE_STEPS = 4
 """Time steps between updates of what depends on the state (friction, load, curved floor)."""
 
@@ -71,6 +73,9 @@ class InjectedMujocoTruth:
         self._mujoco = load_mujoco()
         self._hidden, self._steps, self._scene = hidden, steps, scene
         self._effects = active_effects(hidden)
+        if "arm_friction" in self._effects:
+            hold = max(self.settings.hold_time, DRY_HOLD_TIME)
+            self.settings = replace(self.settings, hold_time=hold)
         self._stiffness = scene.stiffness.detach().numpy().astype(np.float64) * np.exp(
             [
                 self._effects.get("stiffness_error", "log_ratio_x"),
@@ -134,7 +139,6 @@ class InjectedMujocoTruth:
 
     def external_wrench(self) -> Float[Tensor, " 3"]:
         """Contact, adhesion and load summed after the last `step`, before the sensor."""
-        self._before_step()
         self._mujoco.mj_forward(self._model, self._data)
         data = self._data
         wrench = data.qfrc_constraint[:3] + data.qfrc_applied[:3]

@@ -127,8 +127,9 @@ def world_xml(
     it; pairs follow in this order too, the floor's before the wall's.
     """
     loss = effects.get("arm_friction", "force")
-    # Next to rigid while it holds: the arm creeps by less than 1e-6 m/s.
-    held = f'frictionloss="{loss!r}" solimpfriction="0.9999 0.9999 0.001 0.5 2"' if loss else ""
+    # As rigid as MuJoCo can be: while dry friction holds, the arm creeps by 1e-7 m/s.
+    rigid = f'solreffriction="{2 * settings.time_step!r} 1" solimpfriction="0.9999 0.9999 1 0.5 2"'
+    held = f'frictionloss="{loss!r}" {rigid}' if loss else ""
     joints, actuators = impedance_xml(stiffness, settings, (held, held, ""))
     grip = ""
     if compliance := effects.get("grasp_compliance", "compliance"):

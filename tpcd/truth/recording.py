@@ -20,6 +20,7 @@ from torch import Tensor
 from tpcd.data.episode import Episode, episode_contents, read_rows, write_together
 from tpcd.data.header import Header
 from tpcd.errors import EpisodeError
+from tpcd.truth.diagnosis_motion import diagnosis_motion
 from tpcd.truth.motions import (
     History,
     Motion,
@@ -33,7 +34,7 @@ from tpcd.truth.scene import Scene
 DEFAULT_SENSOR_STD = (2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02)
 """Noise of x, z [m], phi [rad], F_x, F_z [N], tau [N·m]."""
 
-Policy = Literal["rich", "press_and_slide", "test"]
+Policy = Literal["rich", "press_and_slide", "diagnosis", "test"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ def make_motion(policy: Policy, scene: Scene, steps: int, generator: torch.Gener
         return rich_exploration(generator)
     if policy == "press_and_slide":
         return press_and_slide(generator)
+    if policy == "diagnosis":
+        return diagnosis_motion(generator)
     if policy == "test":
         return planned_test(
             scene.vertices_ee,
@@ -62,7 +65,8 @@ def make_motion(policy: Policy, scene: Scene, steps: int, generator: torch.Gener
             generator,
             scene.stiffness,
         )
-    raise ValueError(f"policy is {policy!r}, expected 'rich', 'press_and_slide' or 'test'")
+    expected = "'rich', 'press_and_slide', 'diagnosis' or 'test'"
+    raise ValueError(f"policy is {policy!r}, expected {expected}")
 
 
 def record(

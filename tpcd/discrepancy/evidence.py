@@ -1,0 +1,182 @@
+"""How well a model explains a history: its evidence and posterior, from the prior, on some seeds.
+
+Every model is fitted in the same way and with the same budget: importance sampling of the whole
+history at once, with modes found by climbing from all over the prior. Parameters of effects are
+entries of theta like all others, so effects and shape, mount, floor, wall and friction compete
+for the same data.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.belief.belief import Belief, belief_of
+from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
+from tpcd.belief.history import History
+from tpcd.belief.importance import draw_pool
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.pool import known_weights, truncate
+from tpcd.belief.prior import ParameterPrior
+from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.target import ContactTarget
+from tpcd.effects.protocol import Effect
+from tpcd.random import stream
+from tpcd.simulator import StepSettings
+
+FIT_SAMPLER = SamplerSettings(particles=300, draws=2000, prior_draws=500)
+"""Budget of one fit on one seed."""
+_REMEMBERED = 12
+"""Places of an earlier fit that a new one starts from as well."""
+_WITHIN = 2.5
+"""A null value at the end of a prior is started from within so many standard scores."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What every model is asked: the same data, prior of the scene and budget."""
+
+    history: History
+    scene: ParameterPrior
+    misfit: MisfitField
+    step: StepSettings
+    sampler: SamplerSettings = FIT_SAMPLER
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model with its evidence on each seed, and its posterior."""
+
+    effects: tuple[Effect, ...]
+    step: StepSettings
+    prior: ParameterPrior
+    by_seed: tuple[float, ...]
+    """Log evidence on each seed."""
+    cloud: Cloud
+    """Particles of all seeds, weighted by evidence."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the mean evidence of the seeds."""
+        return _log_mean(self.by_seed)
+
+    @property
+    def spread(self) -> float:
+        """Largest difference of the log evidence between seeds; infinite for a single one."""
+        return max(self.by_seed) - min(self.by_seed) if len(self.by_seed) > 1 else math.inf
+
+
+def fit_model(
+    question: Question,
+    effects: Sequence[Effect],
+    seeds: Sequence[int],
+    start: Sequence[Fit] = (),
+    step: StepSettings | None = None,
+) -> Fit:
+    """Fit the base model with these effects; seeds are told apart by their numbers.
+
+    Besides the prior, a fit also starts from where those in `start` arrived.
+    """
+    effects = tuple(effects)
+    prior = question.scene.with_effects(effects)
+    step = question.step if step is None else step
+    target = ContactTarget(prior, question.misfit, step, question.history)
+    by_seed, clouds = [], []
+    for seed in seeds:
+        name = "+".join(effect.name for effect in effects)
+        generator = stream(question.seed, zlib.crc32(name.encode()), seed)
+        begin = start_cloud(target.sample(question.sampler.particles, generator))
+        remembered = [carried(fit, prior, generator) for fit in start]
+        if remembered:
+            begin = replace(begin, modes=torch.cat(remembered))
+        pool = draw_pool(begin, target, 1, question.sampler, generator)
+        weights = truncate(known_weights(pool.log_weights))
+        index, counts = systematic_resample(weights, question.sampler.particles, generator).unique(
+            return_counts=True
+        )
+        by_seed.append(pool.log_evidence)
+        clouds.append(
+            Cloud(
+                pool.positions[index],
+                counts.double() / question.sampler.particles,
+                pool.log_likelihood[index],
+                pool.log_evidence,
+                pool.log_evidence_std,
+                pool.modes,
+                pool.shares,
+            )
+        )
+    return Fit(effects, step, prior, tuple(by_seed), _joined(clouds))
+
+
+def joined_fit(one: Fit, other: Fit) -> Fit:
+    """Two fits of one model on different seeds as one."""
+    clouds = [
+        replace(fit.cloud, log_evidence=fit.log_evidence + math.log(len(fit.by_seed)))
+        for fit in (one, other)
+    ]
+    return replace(one, by_seed=one.by_seed + other.by_seed, cloud=_joined(clouds))
+
+
+def posterior(question: Question, fit: Fit) -> Belief:
+    """The belief of a fit, which predicts."""
+    target = ContactTarget(fit.prior, question.misfit, fit.step, question.history)
+    return belief_of(fit.cloud, target)
+
+
+def carried(fit: Fit, prior: ParameterPrior, generator: torch.Generator) -> Float[Tensor, "k s"]:
+    """Places of a fit in the coordinates of another model: effects that both have are kept,
+    new ones start at their null value and at draws from their prior."""
+    best = fit.cloud.weights.argsort(descending=True)[:_REMEMBERED]
+    places = fit.cloud.positions[best]
+    scene = prior.scene_dimension
+    columns = [places[:, :scene]]
+    own = dict(zip(fit.prior.names[scene:], places[:, scene:-1].T, strict=True))
+    null = torch.cat((prior.low[:scene], _null(prior)))
+    null_score = prior.to_score(null)[scene:].clamp(-_WITHIN, _WITHIN)
+    for k, name in enumerate(prior.names[scene:]):
+        drawn = torch.randn(len(places), generator=generator, dtype=torch.float64)
+        drawn[::2] = null_score[k]
+        columns.append(own.get(name, drawn)[:, None])
+    return torch.cat((*columns, places[:, -1:]), dim=-1)
+
+
+def _null(prior: ParameterPrior) -> Tensor:
+    values = [p.null for effect in prior.effects for p in effect.parameters]
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _joined(clouds: Sequence[Cloud]) -> Cloud:
+    """Clouds of one target as one, weighted by their evidence."""
+    evidence = [cloud.log_evidence for cloud in clouds]
+    share = torch.tensor(evidence, dtype=torch.float64).softmax(0)
+    weights = torch.cat([s * cloud.weights for s, cloud in zip(share, clouds, strict=True)])
+    positions = torch.cat([cloud.positions for cloud in clouds])
+    likelihood = torch.cat([cloud.log_likelihood for cloud in clouds])
+    kept = weights > 1e-6
+    best = clouds[int(share.argmax())]
+    return replace(
+        best,
+        positions=positions[kept],
+        weights=weights[kept] / weights[kept].sum(),
+        log_likelihood=likelihood[kept],
+        log_evidence=_log_mean(evidence),
+        modes=torch.cat([cloud.modes for cloud in clouds]),
+    )
+
+
+def _log_mean(values: Sequence[float]) -> float:
+    found = torch.tensor(values, dtype=torch.float64)
+    return float(torch.logsumexp(found, 0)) - math.log(len(values))

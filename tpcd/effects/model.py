@@ -1,0 +1,169 @@
+"""An augmented model as a file: which effects the simulator has besides, and how it steps.
+
+A YAML file:
+
+    effects:
+      - name: floor_compliance           # from the catalogue
+        parameters:                      # optional: narrower priors, SI units
+          compliance: [1.0e-4, 4.0e-4]
+      - name: magnet                     # an effect of your own
+        file: my_effects.py              # relative to this file; holds EFFECTS = (...)
+    step:                                # optional: settings of the step
+      substeps: 4
+
+Reading a file with `file:` runs the Python code in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tpcd.effects.catalogue import CATALOGUE, find_effect
+from tpcd.effects.protocol import SITES, Effect, EffectParameter
+from tpcd.errors import ModelError
+from tpcd.simulator.record import StepSettings
+
+
+@dataclass(frozen=True)
+class Model:
+    """Effects and settings of the step."""
+
+    effects: tuple[Effect, ...] = ()
+    step: StepSettings = StepSettings()
+
+
+def load_model(path: str | Path) -> Model:
+    """Read a model file; raises `ModelError` with what is wrong in one line."""
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ModelError(path, "no such file", "give the model.yaml that diagnose wrote") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ModelError(path, f"cannot be read ({' '.join(str(error).split())})") from error
+    if not isinstance(content, Mapping):
+        raise ModelError(path, "is not a mapping", "expected 'effects' and optionally 'step'")
+    unknown = sorted(set(content) - {"effects", "step", "notes"})
+    if unknown:
+        raise ModelError(path, f"has {unknown[0]!r}", "expected 'effects', 'step' and 'notes'")
+    effects = effects_from_plain(content.get("effects") or [], path)
+    given = content.get("step") or {}
+    known = [field.name for field in fields(StepSettings)]
+    if not isinstance(given, Mapping) or set(given) - set(known):
+        raise ModelError(path, f"step is {given!r}", f"expected any of {', '.join(known)}")
+    try:
+        step = StepSettings(**given)
+    except (TypeError, ValueError) as error:
+        raise ModelError(path, f"step: {error}") from error
+    return Model(effects, step)
+
+
+def write_model(model: Model, path: str | Path, notes: str | None = None) -> Path:
+    """Write a model file."""
+    path = Path(path)
+    content: dict[str, Any] = {"effects": effects_to_plain(model.effects)}
+    step = {k: v for k, v in asdict(model.step).items() if v != getattr(StepSettings(), k)}
+    if step:
+        content["step"] = step
+    if notes:
+        content["notes"] = notes
+    path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    return path
+
+
+def effects_to_plain(effects: Sequence[Effect]) -> list[dict[str, Any]]:
+    """Effects with their priors in plain values, as in a model file."""
+    plain = []
+    for effect in effects:
+        one: dict[str, Any] = {"name": effect.name}
+        source = getattr(effect, "source", None)
+        if source:
+            one["file"] = str(source)
+        one["parameters"] = {p.name: [p.low, p.high] for p in effect.parameters}
+        plain.append(one)
+    return plain
+
+
+def effects_from_plain(plain: Any, path: Path) -> tuple[Effect, ...]:
+    """The effects of a model file; raises `ModelError`."""
+    if not isinstance(plain, list):
+        raise ModelError(path, f"effects is {plain!r}", "expected a list")
+    effects = []
+    for entry in plain:
+        if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
+            raise ModelError(path, f"has the effect {entry!r}", "expected at least 'name: ...'")
+        if set(entry) - {"name", "file", "parameters"}:
+            raise ModelError(
+                path, f"has the effect {dict(entry)!r}", "expected name, file and parameters"
+            )
+        own: Iterable[Effect] = CATALOGUE
+        if entry.get("file"):
+            own = load_effects(path.parent / str(entry["file"]))
+        try:
+            effect = find_effect(entry["name"], own)
+            effects.append(_with_priors(effect, entry.get("parameters") or {}))
+        except ValueError as error:
+            raise ModelError(path, str(error)) from error
+    names = [effect.name for effect in effects]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ModelError(path, f"has the effect {twice[0]!r} twice", "leave one out")
+    return tuple(effects)
+
+
+def load_effects(path: Path) -> tuple[Effect, ...]:
+    """The effects that a Python file holds in `EFFECTS`; raises `ModelError`."""
+    path = path.resolve()
+    if not path.is_file():
+        raise ModelError(path, "no such file", "give a Python file that holds EFFECTS")
+    # Two files of one name in different folders are two modules.
+    name = f"tpcd_user_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ModelError(path, "is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ModelError(path, f"fails when it is run: {type(error).__name__}: {error}") from error
+    effects = getattr(module, "EFFECTS", None)
+    if not isinstance(effects, (tuple, list)) or not effects:
+        raise ModelError(path, "holds no EFFECTS", "expected EFFECTS = (effect, ...)")
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise ModelError(path, f"EFFECTS holds {effect!r}", "expected effects; see docs")
+        if effect.site not in SITES:
+            raise ModelError(path, f"{effect.name!r} has the site {effect.site!r}", str(SITES))
+        if not getattr(effect, "source", None):
+            object.__setattr__(effect, "source", str(path))
+    return tuple(effects)
+
+
+def _with_priors(effect: Effect, given: Mapping[str, Any]) -> Effect:
+    """The effect with priors replaced by those that are given."""
+    names = [parameter.name for parameter in effect.parameters]
+    for name in given:
+        if name not in names:
+            raise ValueError(f"effect {effect.name!r} has no {name!r}; expected {', '.join(names)}")
+    parameters: list[EffectParameter] = []
+    for parameter in effect.parameters:
+        ends = given.get(parameter.name)
+        if ends is None:
+            parameters.append(parameter)
+            continue
+        if not isinstance(ends, list) or len(ends) != 2:
+            raise ValueError(
+                f"prior of {effect.name}.{parameter.name} is {ends!r}, expected [low, high]"
+            )
+        low, high = (float(end) for end in ends)
+        parameters.append(replace(parameter, low=low, high=high))
+    return replace(effect, parameters=tuple(parameters))  # type: ignore[type-var]

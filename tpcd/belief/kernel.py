@@ -26,7 +26,7 @@ from tpcd.simulator.kernel import (
     step_element,
 )
 from tpcd.simulator.kernel_geometry import World, new_chains
-from tpcd.simulator.kernel_settle import RELAXED, new_space
+from tpcd.simulator.kernel_settle import JAMMED, RELAXED, new_space
 from tpcd.simulator.kernel_slopes import new_slopes
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -199,7 +199,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                 here, 0, chains, law, extent, request, k, answer, space, slopes, poses, by_theta, i
             )
             answer.poses[k, 2] -= ends
-            if answer.statuses[k] == RELAXED:
+            if answer.statuses[k] == JAMMED:
                 found.jammed[i] = True
                 break
             if found.poses.shape[0] > 0:

@@ -95,8 +95,7 @@ def fit_model(
     target = ContactTarget(prior, question.misfit, step, question.history)
     by_seed, clouds = [], []
     for seed in seeds:
-        name = "+".join(effect.name for effect in effects)
-        generator = stream(question.seed, zlib.crc32(name.encode()), seed)
+        generator = fit_stream(question, effects, seed)
         begin = start_cloud(target.sample(question.sampler.particles, generator))
         remembered = [carried(fit, prior, generator) for fit in start]
         if remembered:
@@ -136,10 +135,18 @@ def posterior(question: Question, fit: Fit) -> Belief:
     return belief_of(fit.cloud, target)
 
 
-def carried(fit: Fit, prior: ParameterPrior, generator: torch.Generator) -> Float[Tensor, "k s"]:
+def fit_stream(question: Question, effects: Sequence[Effect], seed: int) -> torch.Generator:
+    """Random numbers of their own for every model and seed."""
+    name = "+".join(effect.name for effect in effects)
+    return stream(question.seed, zlib.crc32(name.encode()), seed)
+
+
+def carried(
+    fit: Fit, prior: ParameterPrior, generator: torch.Generator, count: int = _REMEMBERED
+) -> Float[Tensor, "k s"]:
     """Places of a fit in the coordinates of another model: effects that both have are kept,
     new ones start at their null value and at draws from their prior."""
-    best = fit.cloud.weights.argsort(descending=True)[:_REMEMBERED]
+    best = fit.cloud.weights.argsort(descending=True)[:count]
     places = fit.cloud.positions[best]
     scene = prior.scene_dimension
     columns = [places[:, :scene]]

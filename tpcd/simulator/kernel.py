@@ -35,6 +35,7 @@ from tpcd.simulator.kernel_settle import (
     CONVERGED,
     INVALID,
     PROBE,
+    JAMMED,
     RELAXED,
     Law,
     linear_system,
@@ -281,7 +282,7 @@ def step_element(
     for a in range(3):
         pose[a] = start[a]
         whole[a, a] = 1.0
-    touched, status, residual = 0, CONVERGED, 0.0
+    touched, status, residual, relaxed = 0, CONVERGED, 0.0, False
     # Run 0 puts the start on what it rests against, run 1 goes straight to the command,
     # runs 2.. follow the command's path where contact has changed.
     rested, substeps = request.rested, request.substeps
@@ -323,9 +324,15 @@ def step_element(
         else:
             landing_response(world, o, start, part, fraction, point, terrain, slopes)
             ended, left = settle(world, o, chains, law, extent, landing, part, space, pose)
-            if ended == RELAXED:
-                status = RELAXED
-                break
+            relaxed = ended == RELAXED
+            if relaxed:
+                for t in range(terrains):
+                    space.friction[t], world.friction[o, t] = world.friction[o, t], 0.0
+                ended, left = settle(world, o, chains, law, extent, landing, part, space, pose)
+                if ended == RELAXED:
+                    status = JAMMED
+                    break
+                ended = RELAXED
             status, residual = max(status, ended), max(residual, left)
             turn = (math.cos(pose[2]), math.sin(pose[2]))
             linear_system(world, o, law, part, pose, turn, space)
@@ -334,6 +341,9 @@ def step_element(
             append_theta(
                 world, o, law, by_theta, moved, (point, terrain), landing, pose, space, slopes
             )
+            if relaxed:
+                for t in range(terrains):
+                    world.friction[o, t] = space.friction[t]
         if run == 0:
             touched, status, residual = _loaded(space), CONVERGED, 0.0
         elif run == 1 and substeps > 1:
@@ -346,6 +356,8 @@ def step_element(
         answer.poses[b, a] = pose[a]
     _modes(space, answer.modes, b)
     _contacts(world, o, pose, space, answer.contacts, b)
+    if relaxed:
+        answer.contacts[b, :, 1] = 0.0
     answer.statuses[b], answer.residuals[b] = status, residual
     copy_rows(whole, 0, answer.from_start[b], 3)
     copy_rows(whole, 3, answer.from_gap[b], terrains)

@@ -27,6 +27,8 @@ PROBE = 0.02
 NEAR = 1e-4
 """A terrain further away than this is no candidate under Coulomb friction [m]."""
 CONVERGED, NOT_CONVERGED, RELAXED, INVALID = 0, 1, 2, 3
+JAMMED = 4
+"""Jammed even without friction, which is left to the torch path."""
 _SOLVED = int(Status.SOLVED)
 
 
@@ -49,7 +51,8 @@ class Space(NamedTuple):
     Rows of the contact problem, up to 2 t LIST of them: `rows`, `values`, `sizes`,
     `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The three
     rows that may carry load: `chosen` (3, 3) point (-1 where free), terrain and place,
-    `multiplier`, `side`, `slipping`. `system` (15, 3) as filled by `linear_system`.
+    `multiplier`, `side`, `slipping`. `system` (15, 3) as filled by `linear_system`. `friction`
+    keeps that of a jammed step while it is answered without.
     """
 
     listed: np.ndarray
@@ -75,6 +78,7 @@ class Space(NamedTuple):
     right: np.ndarray
     change: np.ndarray
     gain: np.ndarray
+    friction: np.ndarray
 
 
 @njit
@@ -106,6 +110,7 @@ def new_space(terrains):
         np.empty(3),
         np.empty(3),
         np.empty(3),
+        np.zeros(terrains),
     )
 
 

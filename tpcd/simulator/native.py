@@ -1,7 +1,7 @@
 """The quasi-static step in compiled loops: tensors in, tensors out.
 
-Used by itself on the CPU where numba is installed and no gradient is asked. The few
-elements that are jammed (status RELAXED) come back unanswered, for the torch path to finish.
+Used by itself on the CPU where numba is installed and no gradient is asked. The few elements
+that are jammed even without friction come back unanswered, for the torch path to finish.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from tpcd.simulator.kernel_geometry import World
     from tpcd.simulator.kernel_settle import Law
 
+JAMMED = 4
+"""Status of an element that the compiled loops leave to the torch path."""
 CHUNK = 64
 """Fewest transitions handed to a thread at once."""
 

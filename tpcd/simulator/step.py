@@ -138,8 +138,8 @@ def _relax_jammed(
     stiffness: Tensor,
     settings: StepSettings,
 ) -> None:
-    """Answer the elements the compiled loops found jammed, without friction."""
-    jammed = torch.nonzero(flat.status == int(StepStatus.RELAXED)).flatten()
+    """Answer the elements that the compiled loops found jammed even without friction."""
+    jammed = torch.nonzero(flat.status == native.JAMMED).flatten()
     if len(jammed) == 0:
         return
     before = None if previous is None else previous[jammed]

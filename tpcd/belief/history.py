@@ -38,6 +38,8 @@ class History:
     """Transitions that count; the others part the history into pieces."""
     seams: Bool[Tensor, " n"]
     """Where one recording ends and another begins; never in use."""
+    parity_counts: bool = True
+    """Whether what pose and wrench say about each other counts where effects can change it."""
 
     def __len__(self) -> int:
         """Number of transitions n."""
@@ -75,8 +77,10 @@ class History:
 
     @property
     def read(self) -> Bool[Tensor, " rows"]:
-        """Rows that take part: those at an end of a transition that counts."""
+        """Rows whose parity counts: those at an end of a transition that counts."""
         ends = torch.zeros(len(self.readings), dtype=torch.bool)
+        if not self.parity_counts:
+            return ends
         ends[1:] |= self.used
         ends[:-1] |= self.used
         return ends
@@ -109,6 +113,7 @@ class History:
             Merged(**{name: value[:, :last] for name, value in vars(self.merged).items()}),
             self.used[:count],
             self.seams[:count],
+            self.parity_counts,
         )
 
     def using(self, used: Bool[Tensor, " n"]) -> History:

@@ -51,6 +51,17 @@ class Merged:
         each = each - 1.5 * math.log(2 * math.pi) - self.log_units
         return each[:, used].sum(-1)
 
+    def standard_parity(
+        self, read: Bool[Tensor, " r"]
+    ) -> tuple[Float[Tensor, "c r 3"], Float[Tensor, "c r 3"]]:
+        """Parity residuals in standard units, at most at the limit, and the logarithms of the
+        units; zero for rows that take no part. Their density is that of `log_parity`."""
+        growth = (self.chi_square / PARITY_LIMIT).clamp_min(1.0).sqrt()
+        scale = self.scale * growth[..., None]
+        units = scale.log() + self.log_units[..., None] / 3
+        here = read[:, None]
+        return torch.where(here, self.offset / scale, 0.0), torch.where(here, units, 0.0)
+
 
 def merge(
     readings: Float[Tensor, "r 6"], variance: Float[Tensor, " 6"], conditions: Conditions

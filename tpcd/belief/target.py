@@ -15,7 +15,7 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
-from tpcd.belief.setting import PARITY_LIMIT, merge
+from tpcd.belief.setting import merge
 from tpcd.simulator import StepSettings, native
 
 _LARGE_MISFIT = 2.0
@@ -107,7 +107,7 @@ class ContactTarget:
             self.step,
             added,
         )
-        parity, parity_scale = self._parity(score)
+        parity, parity_scale = self.parity(score)
         whitened = torch.cat((_known(here.whitened), parity), dim=1)
         log_scale = torch.cat((_known(here.log_scale), parity_scale), dim=1)
         slopes, stretch = [_known(here.slopes)], []
@@ -116,7 +116,7 @@ class ContactTarget:
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE
             there = self.evaluate(moved, innovations=True)
-            parity, parity_scale = self._parity(moved)
+            parity, parity_scale = self.parity(moved)
             found = torch.cat((_known(there.whitened), parity), dim=1)
             scale = torch.cat((_known(there.log_scale), parity_scale), dim=1)
             slopes.append(((found - whitened) / _DIFFERENCE)[:, None])
@@ -127,7 +127,7 @@ class ContactTarget:
         still = torch.zeros_like(slopes[0])
         return _Linearised(whitened, torch.cat(slopes, 1), torch.cat((still, *stretch), 1))
 
-    def _parity(self, score: Tensor) -> tuple[Tensor, Tensor]:
+    def parity(self, score: Tensor) -> tuple[Tensor, Tensor]:
         """What pose and wrench of each row say about each other, in standard units, and the
         logarithms of the units; no rows where no effect can change it."""
         if not self.prior.effects:
@@ -137,12 +137,8 @@ class ContactTarget:
         added = self.prior.added_of(self.prior.to_vector(score[:, :-1]))
         conditions = added.apply(history.bare, history.rows, None)
         merged = merge(history.readings, history.sensor_variance, conditions)
-        growth = (merged.chi_square / PARITY_LIMIT).clamp_min(1.0).sqrt()
-        scale = merged.scale * growth[..., None]
-        read = history.read[:, None]
-        whitened = torch.where(read, merged.offset / scale, 0.0)
-        units = torch.where(read, scale.log() + merged.log_units[..., None] / 3, 0.0)
-        return tuple(part.expand(len(score), -1, -1) for part in (whitened, units))
+        found = merged.standard_parity(history.read)
+        return found[0].expand(len(score), -1, -1), found[1].expand(len(score), -1, -1)
 
     def evaluate(
         self,

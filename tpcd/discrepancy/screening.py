@@ -7,7 +7,6 @@ from its prior. The best of them says which candidates deserve the full fit from
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,6 +28,8 @@ class Glance:
     effect: Effect
     log_evidence: float
     """By Laplace's approximation at the best mode found."""
+    sd: tuple[float, ...]
+    """Standard deviation there of each parameter of the effect, in SI units."""
 
 
 def glance(question: Question, base: Fit, effect: Effect) -> Glance:
@@ -42,9 +43,9 @@ def glance(question: Question, base: Fit, effect: Effect) -> Glance:
     _, information = target.curvature(points[best])
     width = -0.5 * torch.linalg.slogdet(information).logabsdet
     each = height[best] + width + 0.5 * information.shape[-1] * math.log(2 * math.pi)
-    return Glance(effect, float(each.max()))
-
-
-def shortlist(glances: Sequence[Glance], count: int) -> list[Effect]:
-    """The candidates that look best."""
-    return [g.effect for g in sorted(glances, key=lambda g: -g.log_evidence)[:count]]
+    top = int(each.argmax())
+    covariance = torch.linalg.inv(information[top])
+    vector, slope = prior.to_vector_with_slope(points[best[top]][:-1])
+    own = slice(len(vector) - len(effect.parameters), len(vector))
+    sd = covariance.diagonal()[:-1].sqrt() * slope
+    return Glance(effect, float(each[top]), tuple(sd[own].tolist()))

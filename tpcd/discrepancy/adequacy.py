@@ -1,0 +1,185 @@
+"""Does a model explain the data at all? Tests of what it leaves, without an alternative.
+
+Under a true model the innovations of the filter are independent standard normal numbers, for
+every particle of the posterior. Cells of contact mode x channel x covariate ask whether any
+kind of transition departs from that, with the largest score compared to the largest of all
+cells in draws of standard normal numbers (max-T: Westfall and Young 1993). Innovations at the
+filter's border, which a model does not explain, are counted apart: stick and slip make a few of
+them under a true model too.
+
+The parity residual w - K (x - u) needs no theta and no contact model: it tells effects of the
+arm and of the sensors from all others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.belief.compiled import compiled_filter
+from tpcd.belief.filtered import filter_history
+from tpcd.belief.history import History
+from tpcd.belief.kalman import OUTLIER_SQUARE
+from tpcd.belief.likelihood import effective_setting, outcome_of
+from tpcd.contact import scene_from_parameters
+from tpcd.discrepancy.diagnosis import Cell
+from tpcd.discrepancy.evidence import Fit, Question
+from tpcd.effects.conditions import FLOOR, WALL, Outcome
+from tpcd.simulator import native
+
+DRAWS = 4000
+"""Draws of standard normal numbers for the largest score."""
+PARTICLES = 40
+FEWEST = 4
+"""A cell needs so many transitions."""
+EXPECTED_UNEXPLAINED = 0.03
+"""Share of transitions that a true model leaves at the border: stick and slip hang on less than
+anything that is measured."""
+CHANNELS = ("x", "z", "phi")
+COVARIATES = ("mean", "size", "load", "place", "angle", "time")
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """What a model leaves."""
+
+    unexplained: float
+    """Share of transitions beyond the border of the filter."""
+    unexplained_p: float
+    """Probability of as many under a true model."""
+    cells_p: float
+    """Probability of as large a largest score under a true model."""
+    cells: tuple[Cell, ...]
+    """The cells, those with the largest scores first."""
+
+    def adequate(self, level: float) -> bool:
+        """Whether nothing departs at this level."""
+        return self.unexplained_p > level and self.cells_p > level
+
+
+def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> Adequacy:
+    """Test the innovations of the posterior's best particles."""
+    whitened, outcome, weights = innovations(question, fit)
+    history = question.history
+    used = history.used
+    square = (whitened**2).sum(-1)
+    border = (square > OUTLIER_SQUARE - 1e-6).double()
+    count = int(used.sum())
+    unexplained = float((weights @ border)[used].sum()) / max(count, 1)
+    modes = _modes(outcome)[1:]
+    explained = (1.0 - border) * used
+    designs, names = _designs(history, outcome, modes, used)
+    values = torch.where(explained[..., None] > 0, whitened.nan_to_num(0.0), 0.0)
+    mean = (weights[:, None, None] * values).sum(0)
+    share = (weights[:, None] * explained).sum(0)
+    noise = torch.randn(DRAWS, count, 3, generator=generator, dtype=torch.float64)
+    full = noise.new_zeros(DRAWS, len(used), 3)
+    full[:, used] = noise
+    scores, largest = [], torch.zeros(DRAWS, dtype=torch.float64)
+    for (mode, covariate), design in zip(names, designs, strict=True):
+        weight = design * share.sqrt()
+        norm = float(weight.norm())
+        if norm == 0:
+            continue
+        for channel in range(3):
+            data, drawn = mean[:, channel], full[:, :, channel]
+            if covariate == "size":
+                data, drawn = (data**2 - 1) / math.sqrt(2), (drawn**2 - 1) / math.sqrt(2)
+            score = float(weight @ data) / norm
+            largest = torch.maximum(largest, (drawn @ weight / norm).abs())
+            rows = int((design != 0).sum())
+            scores.append(Cell(mode, CHANNELS[channel], covariate, score, rows))
+    scores.sort(key=lambda cell: -abs(cell.score))
+    top = abs(scores[0].score) if scores else 0.0
+    return Adequacy(
+        unexplained,
+        _at_least(round(unexplained * count), count, EXPECTED_UNEXPLAINED),
+        float((largest >= top).double().mean()),
+        tuple(scores),
+    )
+
+
+def innovations(
+    question: Question, fit: Fit
+) -> tuple[Float[Tensor, "m n 3"], Outcome, Float[Tensor, " m"]]:
+    """Innovations of the best particles, how their rows settle (the best one's), and weights."""
+    order = fit.cloud.weights.argsort(descending=True)[:PARTICLES]
+    positions = fit.cloud.positions[order]
+    weights = fit.cloud.weights[order] / fit.cloud.weights[order].sum()
+    prior, history = fit.prior, question.history
+    vectors = prior.to_vector(positions[:, :-1])
+    sd = question.misfit.sd_of(positions[:, -1])
+    scene = scene_from_parameters(prior.shape, prior.parameters_of(vectors))
+    added = prior.added_of(vectors)
+    setting = effective_setting(scene, history, sd, question.misfit, fit.step, added)
+    run = compiled_filter if native.available() else filter_history
+    found = run(
+        scene.points_ee, setting, sd, question.misfit, fit.step, innovations=True, steps=True
+    )
+    assert found.whitened is not None and found.steps is not None
+    outcome = outcome_of(found.steps, history)
+    return found.whitened, Outcome(**{k: v[:1] for k, v in vars(outcome).items()}), weights
+
+
+def parity_score(history: History) -> tuple[float, float]:
+    """Mean parity chi-square for each degree of freedom, and its probability under the noise
+    that is stated; needs no theta."""
+    square = history.merged.chi_square[0][history.read]
+    freedom = 3 * len(square)
+    half = torch.tensor(freedom / 2.0, dtype=torch.float64)
+    p = float(torch.special.gammaincc(half, square.sum() / 2))
+    return float(square.mean()) / 3, p
+
+
+def _modes(outcome: Outcome) -> list[str]:
+    """The contact mode of every row in words, of the first particle."""
+    words = []
+    for mode in outcome.mode[0].tolist():
+        floor, wall = mode[FLOOR], mode[WALL]
+        if floor and wall:
+            words.append("corner")
+        elif floor:
+            words.append("floor, " + ("stick", "slides right", "slides left")[floor - 1])
+        elif wall:
+            words.append("wall, " + ("stick", "slides up", "slides down")[wall - 1])
+        else:
+            words.append("free")
+    return words
+
+
+def _designs(
+    history: History, outcome: Outcome, modes: list[str], used: Tensor
+) -> tuple[list[Tensor], list[tuple[str, str]]]:
+    """Weights (n) of the transitions in every cell, and mode and covariate of the cells."""
+    load = outcome.load[0, 1:].sum(-1)
+    values = {
+        "mean": torch.ones_like(load),
+        "size": torch.ones_like(load),
+        "load": load,
+        "place": history.poses[1:, 0],
+        "angle": history.poses[1:, 2],
+        "time": history.rows.share[1:],
+    }
+    designs, names = [], []
+    groups = {"all": used, **{m: used & torch.tensor([k == m for k in modes]) for m in set(modes)}}
+    for mode, rows in sorted(groups.items()):
+        if int(rows.sum()) < FEWEST:
+            continue
+        for covariate in COVARIATES:
+            value = values[covariate]
+            if covariate not in ("mean", "size"):
+                value = value - value[rows].mean()
+            designs.append(torch.where(rows, value, 0.0))
+            names.append((mode, covariate))
+    return designs, names
+
+
+def _at_least(found: int, count: int, share: float) -> float:
+    """Probability of at least so many of `count` when each has the probability `share`."""
+    from scipy.stats import binom
+
+    return float(binom.sf(found - 1, count, share))

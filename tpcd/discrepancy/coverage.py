@@ -1,0 +1,144 @@
+"""Preflight: what an episode excites, so which effects it could show at all.
+
+Contact is read from the impedance, K (pose - command), which needs no force sensor: a force up
+is the floor; a force to the left beyond what friction on the floor could give is the wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tpcd.data.episode import Episode
+from tpcd.truth.motions import LARGEST_FRICTION, TOUCH_FORCE
+
+MOVED = 0.005
+"""A row that moved further than this along a surface slid on it [m]."""
+STILL = 0.001
+"""A row that moved less than this stuck to it [m]."""
+NEEDED: dict[str, float] = {
+    "free motion": 2,
+    "pause": 1,
+    "lift-off": 1,
+    "floor load": 3,
+    "floor loads": 1.8,
+    "floor places": 0.03,
+    "floor slip": 2,
+    "floor slip both ways": 1,
+    "floor stick": 2,
+    "wall load": 3,
+    "wall loads": 1.8,
+    "wall places": 0.02,
+    "wall slip": 2,
+}
+"""How much of each excitation is needed: rows, the ratio of largest to smallest load, or how
+far apart the places are [m]."""
+MOTIONS: dict[str, str] = {
+    "free motion": "move 20 mm or more in free space, both ways on each axis",
+    "pause": "command the same pose twice",
+    "lift-off": "lift off the floor and touch it again",
+    "floor load": "press on the floor",
+    "floor loads": "press on one spot of the floor with 1.5, 3.5 and 6 N",
+    "floor places": "press on the floor at three places at least 30 mm apart",
+    "floor slip": "slide along the floor by 20 mm",
+    "floor slip both ways": "slide along the floor to the right and back to the left",
+    "floor stick": "press on the floor and push sideways without sliding",
+    "wall load": "press against the wall",
+    "wall loads": "press on one spot of the wall with 1.5, 3.5 and 6 N",
+    "wall places": "press against the wall at heights at least 20 mm apart",
+    "wall slip": "slide up and down along the wall at one load",
+}
+"""The motion that gives each excitation."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What some episodes excite."""
+
+    counts: dict[str, float]
+    """How much there is of each excitation of `NEEDED`."""
+
+    def missing(self, needs: Sequence[str]) -> list[str]:
+        """Those of the needs that are not met."""
+        return [need for need in needs if self.counts.get(need, 0.0) < NEEDED[need]]
+
+
+def coverage_of(episodes: Sequence[Episode]) -> Coverage:
+    """What the episodes excite together; each is one run of its own."""
+    found = [_of_one(episode) for episode in episodes]
+    spans = ("floor loads", "wall loads", "floor places", "wall places")
+    return Coverage(
+        {need: (max if need in spans else sum)(one[need] for one in found) for need in NEEDED}
+    )
+
+
+def contact_rows(episode: Episode) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
+    """Rows in contact with the floor, and with the wall."""
+    force = _force(episode)
+    floored = force[:, 1] > TOUCH_FORCE / 2
+    walled = -force[:, 0] > LARGEST_FRICTION * force[:, 1].clamp_min(0.0) + TOUCH_FORCE / 2
+    return floored, walled
+
+
+def _of_one(episode: Episode) -> dict[str, float]:
+    force = _force(episode)
+    floored, walled = contact_rows(episode)
+    free = ~floored & ~walled
+    move = torch.zeros_like(episode.poses)
+    move[1:] = episode.poses[1:] - episode.poses[:-1]
+    change = torch.zeros_like(force)
+    change[1:] = force[1:] - force[:-1]
+    asked = torch.zeros_like(move)
+    asked[1:] = episode.commands[1:] - episode.commands[:-1]
+    on_floor, on_wall = (_both(rows) for rows in (floored & ~walled, walled & ~floored))
+    right, left = (on_floor & (side * move[:, 0] > MOVED) for side in (1, -1))
+    still = asked.abs().amax(-1) < 1e-9
+    still[0] = False
+    stuck = on_floor & (move[:, 0].abs() < STILL) & (change[:, 0].abs() > 0.5)
+    left_floor = torch.zeros_like(free)
+    left_floor[1:] = floored[:-1] & (force[1:, 1] < TOUCH_FORCE / 4)
+    counts = {
+        "free motion": free & (move[:, :2].norm(dim=-1) > 2 * MOVED),
+        "pause": still,
+        "lift-off": left_floor,
+        "floor load": floored,
+        "floor slip": right | left,
+        "floor stick": stuck,
+        "wall load": walled,
+        "wall slip": on_wall & (move[:, 1].abs() > MOVED),
+    }
+    result = {name: float(rows.sum()) for name, rows in counts.items()}
+    result["floor slip both ways"] = float(min(right.sum(), left.sum()))
+    result["floor loads"] = _ratio(force[floored, 1])
+    result["wall loads"] = _ratio(-force[walled, 0])
+    result["floor places"] = _span(episode.poses[floored, 0])
+    result["wall places"] = _span(episode.poses[walled, 1])
+    return result
+
+
+def _force(episode: Episode) -> Float[Tensor, "n 2"]:
+    return (episode.stiffness * (episode.poses - episode.commands))[:, :2]
+
+
+def _both(rows: Tensor) -> Tensor:
+    """Rows that are in contact like the row before."""
+    both = rows.clone()
+    both[0] = False
+    both[1:] &= rows[:-1]
+    return both
+
+
+def _ratio(loads: Tensor) -> float:
+    """Largest to smallest, without the outermost tenths."""
+    if len(loads) < 3:
+        return 0.0
+    low, high = torch.quantile(loads, torch.tensor([0.1, 0.9], dtype=loads.dtype)).tolist()
+    return high / max(low, 0.1)
+
+
+def _span(places: Tensor) -> float:
+    return float(places.max() - places.min()) if len(places) > 1 else 0.0

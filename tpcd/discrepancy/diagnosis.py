@@ -1,0 +1,158 @@
+"""What a diagnosis found, in plain values that can be written, compared and drawn."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from tpcd.belief.belief import Belief
+
+Verdict = Literal[
+    "nothing_missing",
+    "named",
+    "ambiguous",
+    "formula",
+    "unknown_remains",
+    "not_enough_information",
+]
+CHANNELS = ("x", "z", "phi", "F_x", "F_z", "tau")
+"""Channels of the gap in order; units m, m, rad, N, N, N·m."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter: of an effect, or an entry of theta."""
+
+    name: str
+    value: float
+    """Posterior mean, in SI units."""
+    sd: float
+    low: float
+    """90 % interval."""
+    high: float
+    unit: str
+    shown: str = ""
+    """Value and sd as text in the unit in which people read it."""
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect that the data ask for, with its size."""
+
+    name: str
+    parameters: tuple[Estimate, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that was tried in one round: the effects of the round before and one more."""
+
+    name: str
+    round: int
+    gain: float
+    """Log evidence minus that of the model of the round before."""
+    by_seed: tuple[float, ...] = ()
+    """Log evidence on each seed of the full fit; empty where the quick look was all."""
+    outcome: str = ""
+    """Accepted, or why not."""
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A model that explains the data about as well, and the motion that would decide."""
+
+    names: tuple[str, ...]
+    gain: float
+    """Log evidence minus that of the model without its last effect."""
+    deciding_motion: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One test of what a model leaves: a channel in a contact mode, against a covariate."""
+
+    mode: str
+    channel: str
+    covariate: str
+    score: float
+    """In standard deviations of what the model itself would leave."""
+    count: int
+    """Transitions in the cell."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Root mean square errors of one-step predictions of one channel, in its SI unit."""
+
+    channel: str
+    unit: str
+    before: float
+    after: float
+    noise_floor: float
+    """What sensor noise alone leaves."""
+    closed: float
+    """Share of the excess over the noise floor that is gone; NaN without an excess."""
+    low: float
+    """90 % interval of that share."""
+    high: float
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The smallest size of an effect that these data would show, or why they show none."""
+
+    name: str
+    parameter: str
+    size: float
+    """In SI units; infinite where the excitation is missing."""
+    shown: str
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """All of it; `belief` is the posterior under the final model."""
+
+    verdict: Verdict
+    sentence: str
+    effects: tuple[NamedEffect, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    log_evidence_base: float = float("nan")
+    log_evidence: float = float("nan")
+    gap: tuple[Gap, ...] = ()
+    share_closed: float = float("nan")
+    """Of the excess of all channels together, in units of the noise."""
+    held_out: str = ""
+    """Which data the gap was measured on."""
+    cells_before: tuple[Cell, ...] = ()
+    cells_after: tuple[Cell, ...] = ()
+    unexplained_before: float = float("nan")
+    """Share of transitions that the base model does not explain."""
+    unexplained_after: float = float("nan")
+    theta_before: tuple[Estimate, ...] = ()
+    theta_after: tuple[Estimate, ...] = ()
+    detection_limits: tuple[Limit, ...] = ()
+    coverage: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    seconds: float = 0.0
+    belief: Belief | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects found."""
+        return tuple(effect.name for effect in self.effects)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for `verdict.json`, without the belief."""
+        parts = {k: v for k, v in vars(self).items() if k != "belief"}
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, (tuple, list)):
+                return [plain(one) for one in value]
+            if hasattr(value, "__dataclass_fields__"):
+                return asdict(value)
+            return value
+
+        return {k: plain(v) for k, v in parts.items()}

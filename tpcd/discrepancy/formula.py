@@ -1,0 +1,120 @@
+"""When no effect of the catalogue suffices: let a number of the simulator vary with a covariate.
+
+Each formula is an ordinary effect with units: friction or the height of the floor, as a function
+of something taken at the contact. What it says is a law for these data; why it holds is for
+people to find out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows, angle_difference
+from tpcd.effects.declare import DeclaredEffect, column
+from tpcd.effects.geometry import with_plane
+from tpcd.effects.protocol import EffectParameter
+
+Covariate = Callable[[Outcome, Rows], Tensor]
+"""From the outcome to one number for each particle, row and terrain (m, r, t)."""
+_RAMP = 0.0025
+"""Half width of the ramp at a step of the floor [m]."""
+
+
+def _place(outcome: Outcome, rows: Rows) -> Tensor:
+    return outcome.place[..., 0]
+
+
+def _height(outcome: Outcome, rows: Rows) -> Tensor:
+    return outcome.place[..., 1]
+
+
+def _angle(outcome: Outcome, rows: Rows) -> Tensor:
+    return outcome.pose[..., 2:].expand_as(outcome.load)
+
+
+def _time(outcome: Outcome, rows: Rows) -> Tensor:
+    return rows.share[None, :, None].expand_as(outcome.load)
+
+
+def _slip(outcome: Outcome, rows: Rows) -> Tensor:
+    way = angle_difference(outcome.pose, rows.before(outcome.pose))[..., :2]
+    return way.norm(dim=-1, keepdim=True).expand_as(outcome.load)
+
+
+def _log_friction(covariate: Covariate):
+    def change(
+        conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+    ) -> Conditions:
+        if outcome is None:
+            return conditions
+        exponent = values[:, :1, None] * covariate(outcome, rows)
+        ratio = torch.where(outcome.load > 0, exponent.clamp(-3.0, 3.0).exp(), 1.0)
+        return replace(conditions, friction=conditions.friction * ratio)
+
+    return change
+
+
+def _step(
+    conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+) -> Conditions:
+    if outcome is None:
+        return conditions
+    height, at = column(values, 0), column(values, 1)
+    rise = 0.5 * (1.0 + ((outcome.place[:, :, FLOOR, 0] - at) / _RAMP).tanh())
+    return with_plane(conditions, FLOOR, offset=conditions.offset[:, :, FLOOR] + height * rise)
+
+
+def _stiffening(
+    conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+) -> Conditions:
+    if outcome is None:
+        return conditions
+    sink = column(values, 0) * outcome.load[:, :, FLOOR].clamp_min(0.0).sqrt()
+    return with_plane(conditions, FLOOR, offset=conditions.offset[:, :, FLOOR] - sink)
+
+
+def _friction_formula(name: str, unit: str, most: float, covariate: Covariate) -> DeclaredEffect:
+    return DeclaredEffect(
+        f"log_friction ~ {name}",
+        "contact tangent",
+        (EffectParameter("slope", unit, -most, most),),
+        _log_friction(covariate),
+        f"the logarithm of friction changes by {{0}} with the {name} of the contact",
+        needs=("floor slip",),
+        passes=1,
+    )
+
+
+FORMULAS = (
+    _friction_formula("place", "1/m", 20.0, _place),
+    _friction_formula("height", "1/m", 20.0, _height),
+    _friction_formula("angle", "1/rad", 5.0, _angle),
+    _friction_formula("time", "1", 2.0, _time),
+    _friction_formula("slip", "1/m", 20.0, _slip),
+    DeclaredEffect(
+        "floor_height ~ step",
+        "geometry",
+        (
+            EffectParameter("height", "m", -0.01, 0.01, shown_unit="mm", shown_factor=1e3),
+            EffectParameter("place", "m", -0.1, 0.2, null=0.05, shown_unit="mm", shown_factor=1e3),
+        ),
+        _step,
+        "the floor is higher by {0} beyond x = {1}",
+        needs=("floor places",),
+        passes=1,
+    ),
+    DeclaredEffect(
+        "floor_height ~ root of load",
+        "contact normal",
+        (EffectParameter("slope", "m/N^0.5", 0.0, 3e-3),),
+        _stiffening,
+        "the floor yields by {0} times the root of the load",
+        needs=("floor loads",),
+        passes=2,
+    ),
+)
+"""Formulas that are tried, in no order."""

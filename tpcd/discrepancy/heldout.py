@@ -1,0 +1,168 @@
+"""Scores on data that a model was not fitted to: blocks held out, and fresh episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.history import History
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.target import ContactTarget
+from tpcd.data.episode import Episode
+from tpcd.discrepancy.diagnosis import CHANNELS, Gap
+from tpcd.discrepancy.evidence import Fit, Question, fit_model, posterior
+from tpcd.planar import wrap_angle
+from tpcd.predict import ContactPredictor
+
+FOLDS = 4
+BLOCK = 5
+"""Transitions that the bootstrap keeps together."""
+RESAMPLES = 2000
+FOLD_SAMPLER = SamplerSettings(
+    particles=200, draws=1000, prior_draws=100, fresh_modes=24, rounds=2, modes=12
+)
+"""Budget of a fit that starts where the fit of all data arrived."""
+UNITS = ("m", "m", "rad", "N", "N", "N·m")
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one-step predictions in the mean, and what noise alone would leave."""
+
+    error: Float[Tensor, "n 6"]
+    noise: Float[Tensor, "n 6"]
+    """Standard deviation of the error of a perfect model."""
+
+
+def folds(history: History, count: int = FOLDS) -> list[Bool[Tensor, " n"]]:
+    """Transitions held out in each fold: blocks one after the other."""
+    place = torch.nonzero(history.used).flatten()
+    parts = []
+    for block in place.tensor_split(min(count, len(place))):
+        mask = torch.zeros_like(history.used)
+        mask[block] = True
+        parts.append(mask)
+    return parts
+
+
+def held_out_scores(question: Question, fit: Fit) -> Float[Tensor, " n"]:
+    """Log predictive density of every transition that counts, fitted without its block."""
+    scores = torch.zeros(len(question.history), dtype=torch.float64)
+    for k, mask in enumerate(folds(question.history)):
+        part = replace(question, history=question.history.using(~mask), sampler=FOLD_SAMPLER)
+        trained = fit_model(part, fit.effects, (100 + k,), start=(fit,), step=fit.step)
+        scores[mask] = _predictive(question, trained)[mask]
+    return scores[question.history.used]
+
+
+def lower_bound(
+    gain: Float[Tensor, " n"], generator: torch.Generator, level: float = 0.05
+) -> float:
+    """Lower bound of the mean gain by a block bootstrap."""
+    blocks = torch.stack([part.sum() for part in gain.split(BLOCK)])
+    draws = torch.randint(len(blocks), (RESAMPLES, len(blocks)), generator=generator)
+    return float(torch.quantile(blocks[draws].sum(1) / len(gain), level))
+
+
+def prediction_errors(question: Question, fit: Fit, episodes: Sequence[Episode]) -> Errors:
+    """One-step predictions of whole episodes of the same set-up."""
+    belief = posterior(question, fit)
+    predictor = ContactPredictor(belief, particles=100)
+    best = belief.weights.argmax()[None]
+    alone = replace(
+        belief,
+        vectors=belief.vectors[best],
+        weights=torch.ones(1, dtype=torch.float64),
+        misfit=MisfitField(0.0),
+        misfit_sd=torch.zeros(1, dtype=torch.float64),
+        misfit_mean=torch.zeros(1, 0, dtype=torch.float64),
+        misfit_covariance=torch.zeros(1, 0, 0, dtype=torch.float64),
+    )
+    errors, noises = [], []
+    for episode in episodes:
+        arguments = (episode.poses[:-1], episode.commands[1:], episode.commands[:-1])
+        stds = (episode.sensor_std[:3], episode.sensor_std)
+        read = torch.cat((episode.poses, episode.wrenches), dim=-1)[1:]
+        error = read - predictor.predict(*arguments, *stds).mean
+        errors.append(torch.cat((error[:, :2], wrap_angle(error[:, 2:3]), error[:, 3:]), dim=-1))
+        noises.append(ContactPredictor(alone).predict(*arguments, *stds).std)
+    return Errors(torch.cat(errors), torch.cat(noises))
+
+
+def held_out_errors(question: Question, fit: Fit, episodes: Sequence[Episode]) -> Errors:
+    """Prediction errors of every transition, by a model fitted without its block."""
+    errors, noises = [], []
+    for k, mask in enumerate(folds(question.history)):
+        part = replace(question, history=question.history.using(~mask), sampler=FOLD_SAMPLER)
+        trained = fit_model(part, fit.effects, (100 + k,), start=(fit,), step=fit.step)
+        found = prediction_errors(part, trained, episodes)
+        rows = mask[~question.history.seams]
+        errors.append(found.error[rows])
+        noises.append(found.noise[rows])
+    return Errors(*(torch.cat(part) for part in (errors, noises)))
+
+
+def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[list[Gap], float]:
+    """The gap of each channel before and after, and the share closed of all of it."""
+    parts = (before.error, after.error, after.noise)
+    known = torch.stack([torch.isfinite(part).all(-1) for part in parts]).all(0)
+    *squares, floor = (torch.square(part[known]) for part in parts)
+    n = len(floor)
+    draws = _block_draws(n, generator)
+
+    def closed(rows: Tensor) -> Tensor:
+        was, now, least = (part[rows].mean(-2) for part in (*squares, floor))
+        excess = was - least
+        return torch.where(excess > 0, (was - torch.maximum(now, least)) / excess, torch.nan)
+
+    whole, resampled = closed(torch.arange(n)), closed(draws)
+    found = []
+    for c, channel in enumerate(CHANNELS):
+        known = resampled[:, c][~resampled[:, c].isnan()]
+        ends = torch.quantile(known, torch.tensor([0.05, 0.95]).double()) if len(known) else None
+        found.append(
+            Gap(
+                channel,
+                UNITS[c],
+                *(float(part[:, c].mean().sqrt()) for part in (*squares, floor)),
+                float(whole[c]),
+                *((math.nan, math.nan) if ends is None else ends.tolist()),
+            )
+        )
+    # All channels together, each in units of its noise.
+    was, now = ((part / floor).mean() - 1 for part in squares)
+    share = float((was - now.clamp_min(0.0)) / was) if was > 0.05 else math.nan
+    return found, share
+
+
+def _block_draws(n: int, generator: torch.Generator) -> Tensor:
+    """Rows (RESAMPLES, about n) of blocks drawn with replacement."""
+    starts = torch.arange(0, n, BLOCK)
+    chosen = starts[torch.randint(len(starts), (RESAMPLES, len(starts)), generator=generator)]
+    rows = chosen[..., None] + torch.arange(min(BLOCK, n))
+    return rows.flatten(1).clamp_max(n - 1)
+
+
+def _predictive(question: Question, fit: Fit) -> Float[Tensor, " n"]:
+    """Log predictive density of every transition under the particles of a fit."""
+    target = ContactTarget(fit.prior, question.misfit, fit.step, question.history)
+    order = fit.cloud.weights.argsort(descending=True)[:100]
+    positions = fit.cloud.positions[order]
+    weights = fit.cloud.weights[order]
+    found = target.evaluate(positions, innovations=True)
+    assert found.whitened is not None and found.log_scale is not None
+    each = -(0.5 * found.whitened**2 + found.log_scale + 0.5 * math.log(2 * math.pi)).sum(-1)
+    if fit.effects:
+        # What pose and wrench say about each other is relative to the model without effects.
+        whitened, scale = target.parity(positions)
+        base, base_scale = question.history.merged.standard_parity(question.history.read)
+        own = -(0.5 * whitened**2 + scale).sum(-1) + (0.5 * base**2 + base_scale).sum(-1)
+        each = each + own[:, 1:]
+    each = torch.where(torch.isfinite(each), each, -100.0)
+    return torch.logsumexp(each + (weights / weights.sum()).log()[:, None], 0)

@@ -29,7 +29,7 @@ NEEDED: dict[str, float] = {
     "floor places": 0.03,
     "floor slip": 2,
     "floor slip both ways": 1,
-    "floor stick": 2,
+    "floor stick": 1,
     "wall load": 3,
     "wall loads": 1.8,
     "wall places": 0.02,
@@ -98,7 +98,7 @@ def _of_one(episode: Episode) -> dict[str, float]:
     right, left = (on_floor & (side * move[:, 0] > MOVED) for side in (1, -1))
     still = asked.abs().amax(-1) < 1e-9
     still[0] = False
-    stuck = on_floor & (move[:, 0].abs() < STILL) & (change[:, 0].abs() > 0.5)
+    stuck = on_floor & (move[:, 0].abs() < STILL) & (change[:, 0].abs() > 0.3)
     left_floor = torch.zeros_like(free)
     left_floor[1:] = floored[:-1] & (force[1:, 1] < TOUCH_FORCE / 4)
     counts = {

@@ -40,8 +40,9 @@ from tpcd.simulator import StepSettings
 
 FEWEST_ROWS = 10
 """Transitions below which nothing is named."""
-WORTH_FITTING = -8.0
-"""Gain of the quick look from which a candidate gets a full fit at all."""
+WORTH_FITTING = {True: 0.0, False: -15.0}
+"""Gain of the quick look from which a candidate gets a full fit at all: where the model explains
+the data as it is, and where it does not."""
 WITHIN = 15.0
 """Candidates whose gain is so close to the best get a second seed."""
 AMBIGUOUS = 3.0
@@ -145,7 +146,8 @@ class _Run:
         for pool in pools:
             while len(current.effects) - len(self.given) < self.settings.most_effects:
                 number = len(current.effects) - len(self.given) + 1
-                current, best, close = self._round(current, pool, number)
+                adequate = self._adequacy(current).adequate(0.05)
+                current, best, close = self._round(current, pool, number, adequate)
                 if number == 1:
                     base = current
                 if best is None:
@@ -167,7 +169,7 @@ class _Run:
         return fit
 
     def _round(
-        self, current: Fit, pool: Sequence[Effect], number: int
+        self, current: Fit, pool: Sequence[Effect], number: int, adequate: bool
     ) -> tuple[Fit, Fit | None, list[Alternative]]:
         """Try one more effect: the model before (perhaps better fitted), the accepted model if
         any, and what explains the data about as well."""
@@ -185,7 +187,7 @@ class _Run:
         chosen = [
             g.effect
             for g in glances[: self.settings.full_fits]
-            if g.log_evidence > current.log_evidence + WORTH_FITTING
+            if g.log_evidence > current.log_evidence + WORTH_FITTING[adequate]
         ]
         fits = [
             fit_model(self.question, (*current.effects, e), (0,), start=(current,)) for e in chosen

@@ -183,7 +183,7 @@ CONTACT_EFFECTS = (
         (EffectParameter("ratio", "1", 1.0, 2.0, null=1.0),),
         _static_kinetic,
         "friction before a slip is {0} times that during it",
-        needs=("floor slip", "floor stick"),
+        needs=("floor slip",),
         passes=1,
     ),
     DeclaredEffect(

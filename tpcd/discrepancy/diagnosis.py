@@ -112,7 +112,7 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """All of it; `belief` is the posterior under the final model."""
+    """All of it; `belief` is the posterior under the final model, `belief_before` that without."""
 
     verdict: Verdict
     sentence: str
@@ -138,6 +138,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
     belief: Belief | None = None
+    belief_before: Belief | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,8 +146,8 @@ class Diagnosis:
         return tuple(effect.name for effect in self.effects)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for `verdict.json`, without the belief."""
-        parts = {k: v for k, v in vars(self).items() if k != "belief"}
+        """Plain values for `verdict.json`, without the beliefs."""
+        parts = {k: v for k, v in vars(self).items() if not k.startswith("belief")}
 
         def plain(value: Any) -> Any:
             if isinstance(value, (tuple, list)):

@@ -24,6 +24,8 @@ FOLDS = 4
 BLOCK = 5
 """Transitions that the bootstrap keeps together."""
 RESAMPLES = 2000
+LEAST_EXCESS = 0.1
+"""Share of the noise's variance that counts as a gap."""
 FOLD_SAMPLER = SamplerSettings(
     particles=200, draws=1000, prior_draws=100, fresh_modes=24, rounds=2, modes=12
 )
@@ -119,7 +121,8 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[lis
     def closed(rows: Tensor) -> Tensor:
         was, now, least = (part[rows].mean(-2) for part in (*squares, floor))
         excess = was - least
-        return torch.where(excess > 0, (was - torch.maximum(now, least)) / excess, torch.nan)
+        share = (was - torch.maximum(now, least)) / excess
+        return torch.where(excess > LEAST_EXCESS * least, share, torch.nan)
 
     whole, resampled = closed(torch.arange(n)), closed(draws)
     found = []

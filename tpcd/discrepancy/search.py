@@ -258,7 +258,7 @@ class _Run:
         after: Adequacy,
         alternatives: list[Alternative],
     ) -> Diagnosis:
-        belief = posterior(self.question, final)
+        belief, first = (posterior(self.question, fit) for fit in (final, base))
         effects = named_effects(belief, len(self.given))
         missing = self.settings.adequacy and not after.adequate(self.settings.level)
         formulas = {formula.name for formula in FORMULAS}
@@ -307,7 +307,7 @@ class _Run:
             cells_after=after.cells,
             unexplained_before=before.unexplained,
             unexplained_after=after.unexplained,
-            theta_before=theta_estimates(posterior(self.question, base)),
+            theta_before=theta_estimates(first),
             theta_after=theta_estimates(belief),
             detection_limits=detection_limits(
                 self.glances, self.settings.catalogue, self.coverage, self.settings.least_gain
@@ -316,6 +316,7 @@ class _Run:
             notes=tuple(self.notes),
             seconds=time.perf_counter() - self.started,
             belief=belief,
+            belief_before=first,
         )
 
     def _stop(self, reason: str) -> Diagnosis:

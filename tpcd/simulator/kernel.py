@@ -34,8 +34,8 @@ from tpcd.simulator.kernel_geometry import (
 from tpcd.simulator.kernel_settle import (
     CONVERGED,
     INVALID,
-    PROBE,
     JAMMED,
+    PROBE,
     RELAXED,
     Law,
     linear_system,

@@ -1,0 +1,93 @@
+"""Find where simulation and measurement disagree, name the missing effect, and add it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tpcd.cli import check_numbers, run
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Settings of the command."""
+
+    episodes: tuple[Path, ...]
+    """Episodes of one set-up: NAME.csv, NAME.parquet or a folder with one episode."""
+    out: Path = Path("runs/diagnosis")
+    """Folder for the results."""
+    prior: str = "ycb-rich"
+    """Shape prior: a checkpoint folder, or the name of a shipped one."""
+    model: Path | None = None
+    """Model file with effects that are already known."""
+    fresh: tuple[Path, ...] = ()
+    """Episodes of the same set-up that only measure the gap; without them blocks are held out."""
+    seed: int = 0
+    """Seed of all random numbers."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        if not self.episodes:
+            raise ValueError("episodes is empty, expected at least one")
+
+
+def diagnose_episodes(config: Diagnose) -> int:
+    """Run the gap workflow and write its verdict, model, figures and report."""
+    import sys
+    from dataclasses import replace
+
+    import torch
+    from torch.utils.tensorboard import SummaryWriter
+
+    from tpcd.commands.diagnosing import EXIT_CODES, write_diagnosis
+    from tpcd.data import check_episode, read_episode
+    from tpcd.discrepancy.search import DiagnosisSettings, diagnose
+    from tpcd.effects.model import Model, load_model
+    from tpcd.results import format_table, run_folder, write_results
+    from tpcd.shape.checkpoint import load_prior
+
+    torch.set_num_threads(1)
+    episodes = [read_episode(path) for path in config.episodes]
+    fresh = [read_episode(path) for path in config.fresh]
+    for episode in (*episodes, *fresh):
+        for warning in check_episode(episode):
+            print(f"warning: {warning}", file=sys.stderr)
+    shape = load_prior(config.prior)
+    model = Model() if config.model is None else load_model(config.model)
+    settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
+    with run_folder(config.out, "scripts/diagnose.py", config, config.overwrite) as folder:
+        found = diagnose(episodes, shape, settings, fresh, model.effects, tell=_tell)
+        rows = [
+            {
+                "channel": f"{gap.channel} [{gap.unit}]",
+                "before": gap.before,
+                "after": gap.after,
+                "noise": gap.noise_floor,
+                "closed": gap.closed,
+            }
+            for gap in found.gap
+        ]
+        if rows:
+            print(f"\none-step errors on {found.held_out}\n{format_table(rows)}")
+        with SummaryWriter(folder / "tensorboard") as writer:
+            write_diagnosis(found, episodes, settings.least_gain, config.prior, folder, writer)
+        write_results(folder, rows, seeds=[config.seed])
+    print(f"\nreport in {config.out}/report.html, verdict in {config.out}/verdict.json", end="")
+    if found.effects:
+        print(
+            f"; next: python scripts/estimate.py EPISODE --prior {config.prior}"
+            f" --model {config.out}/model.yaml --out RUN",
+            end="",
+        )
+    print()
+    return EXIT_CODES[found.verdict]
+
+
+def _tell(line: str) -> None:
+    print(line, flush=True)
+
+
+if __name__ == "__main__":
+    run(diagnose_episodes, Diagnose, positional=("episodes",))

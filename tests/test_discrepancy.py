@@ -1,0 +1,166 @@
+"""The gap workflow on a known outline, and its parts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.history import history_of, joined_history
+from tpcd.belief.likelihood import history_likelihood
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import make_prior
+from tpcd.data.episode import Episode
+from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
+from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
+from tpcd.discrepancy.report_parts import shown_value
+from tpcd.discrepancy.search import DiagnosisSettings, diagnose
+from tpcd.effects import find_effect
+from tpcd.effects.protocol import EffectParameter
+from tpcd.effects.truth import EffectTruth, added_effects
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene
+
+SMALL = DiagnosisSettings(
+    sampler=SamplerSettings(
+        particles=150, draws=600, prior_draws=200, fresh_modes=40, modes=8, rounds=2, places=40
+    ),
+    catalogue=tuple(find_effect(n) for n in ("floor_compliance", "floor_tilt", "command_lag")),
+    full_fits=2,
+)
+
+
+def recorded(hidden: dict[str, dict[str, float]], steps: int = 30, seed: int = 5) -> Episode:
+    generator = torch.Generator().manual_seed(seed)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    truth = EffectTruth(
+        scene.vertices_ee,
+        scene.friction,
+        scene.floor_height,
+        scene.wall_position,
+        scene.stiffness,
+        added_effects(hidden),
+        steps,
+    )
+    motion = make_motion("diagnosis", scene, steps, generator)
+    truth.reset(scene.start_pose)
+    return record(truth, scene, motion, steps, generator).measured
+
+
+@pytest.fixture(scope="module")
+def shape() -> PolygonShape:
+    return PolygonShape(builtin_outlines()["mug"])
+
+
+@pytest.fixture(scope="module")
+def clean() -> Episode:
+    return recorded({})
+
+
+def test_clean_data_miss_nothing(shape: PolygonShape, clean: Episode) -> None:
+    told: list[str] = []
+    found = diagnose([clean], shape, SMALL, tell=told.append)
+    assert found.verdict == "nothing_missing" and found.names == ()
+    assert {limit.name for limit in found.detection_limits} == {e.name for e in SMALL.catalogue}
+    assert told[-1].startswith("verdict: nothing missing")
+
+
+def test_a_soft_floor_is_named_with_its_size_and_the_gap_shrinks(shape: PolygonShape) -> None:
+    size = 3e-4
+    hidden = {"floor_compliance": {"compliance": size}}
+    fresh = recorded(hidden, seed=5)
+    found = diagnose([recorded(hidden)], shape, SMALL, fresh=[fresh])
+    assert found.verdict == "named" and found.names == ("floor_compliance",)
+    (parameter,) = found.effects[0].parameters
+    assert abs(parameter.value - size) < 3 * parameter.sd + 0.1 * size
+    assert "mm per 10 N" in found.sentence
+    by_channel = {gap.channel: gap for gap in found.gap}
+    assert by_channel["z"].after < by_channel["z"].before
+    assert found.share_closed > 0.7
+    assert found.log_evidence - found.log_evidence_base > SMALL.least_gain
+    assert (
+        found.belief is not None and found.belief.prior.names[-1] == "floor_compliance.compliance"
+    )
+
+
+def test_a_short_episode_is_not_enough(shape: PolygonShape, clean: Episode) -> None:
+    found = diagnose([clean.first(6)], shape, SMALL)
+    assert found.verdict == "not_enough_information"
+    assert "5 transitions" in found.sentence
+
+
+def test_set_ups_are_not_mixed(shape: PolygonShape, clean: Episode) -> None:
+    other = replace(clean, stiffness=2 * clean.stiffness)
+    with pytest.raises(ValueError, match="episode 2 has stiffness"):
+        diagnose([clean, other], shape, SMALL)
+
+
+def test_joined_episodes_say_what_each_says_alone(shape: PolygonShape, clean: Episode) -> None:
+    other = recorded({}, steps=8, seed=5)
+    prior = make_prior(shape)
+    draws = prior.to_parameters(prior.sample(6, torch.Generator().manual_seed(1)))
+    sd, field = torch.zeros(6, dtype=torch.float64), MisfitField(0.0)
+
+    def total(*episodes: Episode) -> Tensor:
+        history = joined_history(episodes)
+        return history_likelihood(shape, draws, sd, history, field, StepSettings()).total
+
+    torch.testing.assert_close(total(clean, other), total(clean) + total(other))
+
+
+def test_transitions_out_of_use_do_not_count(shape: PolygonShape, clean: Episode) -> None:
+    history = history_of(clean)
+    prior = make_prior(shape)
+    draws = prior.to_parameters(prior.sample(6, torch.Generator().manual_seed(1)))
+    sd, field = torch.zeros(6, dtype=torch.float64), MisfitField(0.0)
+    used = torch.ones(len(history), dtype=torch.bool)
+    used[10:] = False
+    settings = StepSettings()
+    found = history_likelihood(shape, draws, sd, history.using(used), field, settings).total
+    expected = history_likelihood(shape, draws, sd, history.first(10), field, settings).total
+    torch.testing.assert_close(found, expected)
+
+
+def test_coverage_of_the_diagnosis_motion_and_of_a_poor_one(clean: Episode) -> None:
+    rich = coverage_of([recorded({}, steps=60)])
+    assert set(rich.counts) == set(NEEDED) == set(MOTIONS)
+    assert rich.missing(("floor loads", "wall loads", "floor slip both ways", "lift-off")) == []
+    free = replace(clean, poses=clean.commands.clone())
+    poor = coverage_of([free])
+    assert poor.missing(("floor load", "wall slip")) == ["floor load", "wall slip"]
+
+
+def test_gaps_and_bounds_of_numbers_known_by_hand() -> None:
+    n = 40
+    noise = torch.full((n, 6), 0.1, dtype=torch.float64)
+    sign = torch.tensor([1.0, -1.0]).double().repeat(n // 2)[:, None]
+    before, after = Errors(0.5 * sign.expand(n, 6), noise), Errors(0.2 * sign.expand(n, 6), noise)
+    found, share = gaps(before, after, torch.Generator().manual_seed(0))
+    expected = (0.25 - 0.04) / (0.25 - 0.01)
+    assert [gap.closed for gap in found] == pytest.approx([expected] * 6)
+    assert found[0].low == pytest.approx(expected) and share == pytest.approx(expected)
+    nothing, none = gaps(Errors(noise, noise), Errors(noise, noise), torch.Generator())
+    assert math.isnan(nothing[0].closed) and math.isnan(none)
+    gain = torch.ones(n, dtype=torch.float64)
+    assert lower_bound(gain, torch.Generator().manual_seed(0)) == pytest.approx(1.0)
+    gain[: n // 2] = -1.0
+    assert lower_bound(gain, torch.Generator().manual_seed(0)) < 0
+
+
+def test_every_transition_is_held_out_once(clean: Episode) -> None:
+    history = history_of(clean)
+    masks = torch.stack(folds(history))
+    assert (masks.sum(0) == 1).all()
+
+
+def test_values_are_shown_in_units_for_people() -> None:
+    parameter = EffectParameter("c", "m/N", 0.0, 1.0, shown_unit="mm per 10 N", shown_factor=1e4)
+    assert shown_value(2.46e-4, 1.3e-5, parameter) == "2.46 ± 0.13 mm per 10 N"
+    assert shown_value(0.3, 0.02, EffectParameter("r", "1", 0.0, 1.0)) == "0.300 ± 0.020"

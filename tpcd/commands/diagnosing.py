@@ -1,0 +1,155 @@
+"""What `scripts/diagnose.py` writes: verdict, model, figures, one page of HTML, TensorBoard."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+
+from tpcd.belief.storage import save_belief
+from tpcd.data.episode import Episode
+from tpcd.discrepancy.diagnosis import Cell, Diagnosis
+from tpcd.effects.model import Model, write_model
+from tpcd.figures.diagnosis import evidence_bars, gap_bars, residual_map, theta_shift, worst_stretch
+from tpcd.figures.sinks import save_figure
+from tpcd.predict import ContactPredictor
+from tpcd.results import write_json
+
+EXIT_CODES = {
+    "nothing_missing": 0,
+    "named": 10,
+    "ambiguous": 11,
+    "formula": 12,
+    "unknown_remains": 13,
+    "not_enough_information": 14,
+}
+"""What the command returns for each verdict; 1 and 2 are errors, as everywhere."""
+STRETCH = 20
+"""Rows of the worst stretch."""
+
+
+def write_diagnosis(
+    diagnosis: Diagnosis,
+    episodes: Sequence[Episode],
+    least_gain: float,
+    prior: str,
+    folder: Path,
+    writer: Any,
+) -> Path:
+    """Write all of it into a run folder; returns the page."""
+    write_json(folder / "verdict.json", diagnosis.to_plain())
+    figures: dict[str, tuple[Figure, str]] = {}
+    if diagnosis.belief is not None:
+        belief = diagnosis.belief
+        write_model(
+            Model(belief.prior.effects, belief.step), folder / "model.yaml", diagnosis.sentence
+        )
+        save_belief(belief, folder, prior)
+        figures = draw_diagnosis(diagnosis, episodes, least_gain)
+    images = {}
+    for name, (figure, caption) in figures.items():
+        path = save_figure(figure, folder / "figures", name, writer, heading="diagnosis")
+        images[name] = (caption, base64.b64encode(path.read_bytes()).decode("ascii"))
+    page = folder / "report.html"
+    page.write_text(render_page(diagnosis, images, [e.path for e in episodes]), encoding="utf-8")
+    writer.add_text("verdict", f"**{diagnosis.verdict.replace('_', ' ')}**: {diagnosis.sentence}")
+    return page
+
+
+def draw_diagnosis(
+    diagnosis: Diagnosis, episodes: Sequence[Episode], least_gain: float
+) -> dict[str, tuple[Figure, str]]:
+    """The figures that the diagnosis has data for, each with its caption."""
+    drawn: dict[str, tuple[Figure, str]] = {}
+    rows: dict[str, int] = {}
+    for cell in (*diagnosis.cells_before, *diagnosis.cells_after):
+        if cell.covariate == "mean":
+            rows[cell.mode] = max(rows.get(cell.mode, 0), cell.count)
+    if rows:
+        drawn["residuals"] = (
+            residual_map(
+                _mean_cells(diagnosis.cells_before),
+                _mean_cells(diagnosis.cells_after),
+                sorted(rows.items(), key=lambda row: (row[0] != "all", row[0])),
+            ),
+            "What the models leave, by contact mode and channel (number of transitions).",
+        )
+    tried = [c for c in diagnosis.candidates if math.isfinite(c.gain) and c.round == 1]
+    if tried:
+        drawn["evidence"] = (
+            evidence_bars(
+                [c.name for c in tried],
+                [c.gain for c in tried],
+                [c.name in diagnosis.names for c in tried],
+                least_gain,
+            ),
+            "Candidates of the first round.",
+        )
+    if diagnosis.gap:
+        columns = zip(
+            *((g.channel, g.unit, g.before, g.after, g.noise_floor) for g in diagnosis.gap),
+            strict=True,
+        )
+        drawn["gap"] = (
+            gap_bars(*(list(column) for column in columns)),
+            f"Errors of one-step predictions on {diagnosis.held_out}.",
+        )
+        drawn["theta"] = (
+            theta_shift(
+                [e.name for e in diagnosis.theta_after],
+                [(e.value, e.sd) for e in diagnosis.theta_before],
+                [(e.value, e.sd) for e in diagnosis.theta_after],
+            ),
+            "What the base model held for true, against the model found.",
+        )
+    if diagnosis.belief is not None and diagnosis.belief_before is not None and diagnosis.effects:
+        drawn["stretch"] = (
+            _stretch(diagnosis, episodes[0]),
+            f"The {STRETCH} rows in a row that the base model predicts worst.",
+        )
+    return drawn
+
+
+def render_page(
+    diagnosis: Diagnosis, images: dict[str, tuple[str, str]], paths: Sequence[Path | None]
+) -> str:
+    """One self-contained page of HTML; `images` are captions and PNG files in base 64."""
+    import jinja2
+
+    template = (Path(__file__).parent / "diagnosis.html").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(template).render(
+        d=diagnosis,
+        images=images,
+        episodes=[str(path) for path in paths if path is not None],
+        finite=math.isfinite,
+    )
+
+
+def _mean_cells(cells: Sequence[Cell]) -> list[tuple[str, str, float]]:
+    return [(c.mode, c.channel, c.score) for c in cells if c.covariate == "mean"]
+
+
+def _stretch(diagnosis: Diagnosis, episode: Episode) -> Figure:
+    predicted = []
+    for belief in (diagnosis.belief_before, diagnosis.belief):
+        assert belief is not None
+        found = ContactPredictor(belief, particles=100).predict(
+            episode.poses[:-1], episode.commands[1:], episode.commands[:-1]
+        )
+        predicted.append(found.mean)
+    measured = torch.cat((episode.poses, episode.wrenches), dim=-1)[1:]
+    square = ((predicted[0] - measured) / episode.sensor_std).square().nan_to_num(0.0).sum(-1)
+    length = min(STRETCH, len(square))
+    first = int(square.unfold(0, length, 1).sum(-1).argmax())
+    part, channels = slice(first, first + length), [1, 3, 4]
+    return worst_stretch(
+        (torch.arange(len(measured)) + 1)[part].numpy(),
+        *(value[part][:, channels].numpy() for value in (measured, *predicted)),
+        episode.sensor_std[channels].numpy(),
+    )

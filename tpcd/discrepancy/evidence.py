@@ -12,6 +12,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -34,6 +35,8 @@ FIT_SAMPLER = SamplerSettings(particles=300, draws=2000, prior_draws=500)
 """Budget of one fit on one seed."""
 _REMEMBERED = 12
 """Places of an earlier fit that a new one starts from as well."""
+TIED = 8.0
+"""Seeds whose log evidence is so close to the best count alike."""
 _WITHIN = 2.5
 """A null value at the end of a prior is started from within so many standard scores."""
 
@@ -59,8 +62,13 @@ class Fit:
     prior: ParameterPrior
     by_seed: tuple[float, ...]
     """Log evidence on each seed."""
-    cloud: Cloud
-    """Particles of all seeds, weighted by evidence."""
+    clouds: tuple[Cloud, ...]
+    """Particles of each seed."""
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """Particles of all seeds together."""
+        return _joined(self.clouds)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,16 +125,12 @@ def fit_model(
                 pool.shares,
             )
         )
-    return Fit(effects, step, prior, tuple(by_seed), _joined(clouds))
+    return Fit(effects, step, prior, tuple(by_seed), tuple(clouds))
 
 
 def joined_fit(one: Fit, other: Fit) -> Fit:
     """Two fits of one model on different seeds as one."""
-    clouds = [
-        replace(fit.cloud, log_evidence=fit.log_evidence + math.log(len(fit.by_seed)))
-        for fit in (one, other)
-    ]
-    return replace(one, by_seed=one.by_seed + other.by_seed, cloud=_joined(clouds))
+    return replace(one, by_seed=one.by_seed + other.by_seed, clouds=one.clouds + other.clouds)
 
 
 def posterior(question: Question, fit: Fit) -> Belief:
@@ -166,9 +170,15 @@ def _null(prior: ParameterPrior) -> Tensor:
 
 
 def _joined(clouds: Sequence[Cloud]) -> Cloud:
-    """Clouds of one target as one, weighted by their evidence."""
+    """Clouds of one target as one.
+
+    Differences of evidence between seeds are mostly noise of the sampler, and each seed has few
+    draws that count, all in one place. Seeds near the best therefore count alike, which keeps
+    what they disagree about in the posterior.
+    """
     evidence = [cloud.log_evidence for cloud in clouds]
-    share = torch.tensor(evidence, dtype=torch.float64).softmax(0)
+    found = torch.tensor(evidence, dtype=torch.float64)
+    share = (found - found.max() + TIED).clamp(-math.inf, 0.0).softmax(0)
     weights = torch.cat([s * cloud.weights for s, cloud in zip(share, clouds, strict=True)])
     positions = torch.cat([cloud.positions for cloud in clouds])
     likelihood = torch.cat([cloud.log_likelihood for cloud in clouds])

@@ -46,6 +46,8 @@ the data as it is, and where it does not."""
 WITHIN = 15.0
 """Candidates whose gain is so close to the best get a second seed."""
 AMBIGUOUS = 3.0
+FINAL_SEEDS = (20, 21)
+"""Further seeds of the model that was found."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,10 @@ class _Run:
             now = self._adequacy(current)
             if now.adequate(self.settings.level) or not self.settings.adequacy:
                 break
+        if current is not base:
+            # More seeds, for the sake of honest intervals.
+            more = fit_model(self.question, current.effects, FINAL_SEEDS, start=(current,))
+            current = joined_fit(current, more)
         after = self._adequacy(current)
         self._tell_adequacy("the model found", after)
         return self._conclude(base, current, before, after, alternatives)

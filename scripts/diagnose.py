@@ -12,7 +12,7 @@ from tpcd.cli import check_numbers, run
 class Diagnose:
     """Settings of the command."""
 
-    episodes: tuple[Path, ...]
+    episodes: tuple[Path, ...] = ()
     """Episodes of one set-up: NAME.csv, NAME.parquet or a folder with one episode."""
     out: Path = Path("runs/diagnosis")
     """Folder for the results."""
@@ -26,28 +26,37 @@ class Diagnose:
     """Seed of all random numbers."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
+    compare: tuple[Path, ...] = ()
+    """Folders of earlier runs to put side by side instead."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        if not self.episodes:
-            raise ValueError("episodes is empty, expected at least one")
+        if bool(self.episodes) == bool(self.compare):
+            raise ValueError("give episodes to diagnose, or runs to --compare")
 
 
 def diagnose_episodes(config: Diagnose) -> int:
-    """Run the gap workflow and write its verdict, model, figures and report."""
+    """Run the gap workflow and write its verdict, model, figures and report.
+
+    Returns 0 where nothing is missing, 10 to 14 for the other verdicts in the order named,
+    ambiguous, formula, unknown remains, not enough information.
+    """
     import sys
     from dataclasses import replace
 
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
-    from tpcd.commands.diagnosing import EXIT_CODES, write_diagnosis
+    from tpcd.commands.diagnosing import EXIT_CODES, compare_runs, write_diagnosis
     from tpcd.data import check_episode, read_episode
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.model import Model, load_model
     from tpcd.results import format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
+    if config.compare:
+        print(format_table(compare_runs(config.compare)))
+        return 0
     torch.set_num_threads(1)
     episodes = [read_episode(path) for path in config.episodes]
     fresh = [read_episode(path) for path in config.fresh]

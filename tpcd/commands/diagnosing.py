@@ -15,10 +15,11 @@ from tpcd.belief.storage import save_belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Cell, Diagnosis
 from tpcd.effects.model import Model, write_model
+from tpcd.errors import RunError
 from tpcd.figures.diagnosis import evidence_bars, gap_bars, residual_map, theta_shift, worst_stretch
 from tpcd.figures.sinks import save_figure
 from tpcd.predict import ContactPredictor
-from tpcd.results import write_json
+from tpcd.results import read_json, write_json
 
 EXIT_CODES = {
     "nothing_missing": 0,
@@ -29,6 +30,7 @@ EXIT_CODES = {
     "not_enough_information": 14,
 }
 """What the command returns for each verdict; 1 and 2 are errors, as everywhere."""
+_TIMES = ("before", "after")
 STRETCH = 20
 """Rows of the worst stretch."""
 
@@ -59,6 +61,43 @@ def write_diagnosis(
     page.write_text(render_page(diagnosis, images, [e.path for e in episodes]), encoding="utf-8")
     writer.add_text("verdict", f"**{diagnosis.verdict.replace('_', ' ')}**: {diagnosis.sentence}")
     return page
+
+
+def compare_runs(folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """One row for each run: its verdict, effects and gap. Raises `RunError`."""
+    rows = []
+    for folder in folders:
+        path = folder / "verdict.json"
+        if not path.is_file():
+            raise RunError(path, "no such file", "give folders that diagnose wrote")
+        found = read_json(path)
+        try:
+            parameters = [
+                f"{effect['name']}.{p['name']} {p['shown']}"
+                for effect in found["effects"]
+                for p in effect["parameters"]
+            ]
+            share = found["share_closed"]
+            rows.append(
+                {
+                    "run": folder.name,
+                    "verdict": found["verdict"].replace("_", " "),
+                    "effects": "; ".join(parameters) or "none",
+                    "gap closed": "" if share is None else f"{share:.0%}",
+                    "unexplained": _percent(
+                        found["unexplained_before"], found["unexplained_after"]
+                    ),
+                }
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise RunError(path, f"cannot be read ({error!r})", "diagnose again") from error
+    return rows
+
+
+def _percent(before: float | None, after: float | None) -> str:
+    if before is None or after is None:
+        return ""
+    return f"{before:.0%} to {after:.0%}"
 
 
 def draw_diagnosis(

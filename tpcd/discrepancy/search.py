@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 from tpcd.belief.belief import EstimatorSettings, misfit_field
 from tpcd.belief.cloud import SamplerSettings
@@ -37,6 +38,8 @@ from tpcd.effects.protocol import Effect
 from tpcd.random import stream
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
+
+Result = TypeVar("Result")
 
 FEWEST_ROWS = 10
 """Transitions below which nothing is named."""
@@ -186,7 +189,7 @@ class _Run:
             if effect not in excited:
                 lacks = ", ".join(self.coverage.missing(effect.needs))
                 self._note(effect.name, number, math.nan, (), f"not excited: {lacks}")
-        glances = [glance(self.question, current, effect) for effect in excited]
+        glances = self._each(excited, number, lambda effect: glance(self.question, current, effect))
         glances.sort(key=lambda g: -g.log_evidence)
         if number == 1 and pool is self.settings.catalogue:
             self.glances = glances
@@ -195,9 +198,11 @@ class _Run:
             for g in glances[: self.settings.full_fits]
             if g.log_evidence > current.log_evidence + WORTH_FITTING[adequate]
         ]
-        fits = [
-            fit_model(self.question, (*current.effects, e), (0,), start=(current,)) for e in chosen
-        ]
+        fits = self._each(
+            chosen,
+            number,
+            lambda e: fit_model(self.question, (*current.effects, e), (0,), start=(current,)),
+        )
         top = max((fit.log_evidence for fit in fits), default=-math.inf)
         near = [fit for fit in fits if fit.log_evidence > top - WITHIN]
         near = [
@@ -241,6 +246,20 @@ class _Run:
             if fit.log_evidence > best.log_evidence - AMBIGUOUS
         ]
         return current, best if accepted else None, close
+
+    def _each(
+        self, effects: Sequence[Effect], number: int, work: Callable[[Effect], Result]
+    ) -> list[Result]:
+        """Do something with every candidate; one that fails costs no other."""
+        done = []
+        for effect in effects:
+            try:
+                done.append(work(effect))
+            except Exception as error:
+                reason = f"{effect.name} failed in round {number}: {type(error).__name__}: {error}"
+                self.notes.append(" ".join(reason.split()))
+                self.tell(f"warning: {self.notes[-1]}")
+        return done
 
     def _pruned(self, fit: Fit) -> Fit:
         """The model without earlier effects that it no longer needs."""

@@ -1,0 +1,1 @@
+"""The gap workflow on hidden effects: sealed cases, verdicts, and only then the key."""

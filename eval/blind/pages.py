@@ -1,0 +1,129 @@
+"""Tables and figures of the benchmark: marks, suites, effects, and what was taken for what."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from eval.blind.marks import is_falsely_named, mark_table
+from eval.blind.score import Score, confusion, median_interval, rate, share_interval
+from eval.blind.suites import CLEAN, SUITES
+from tpcd.figures.sinks import save_figure
+from tpcd.figures.style import TEXT, panels, title
+from tpcd.results import format_table, write_text
+
+Row = dict[str, Any]
+
+
+def report(scores: Sequence[Score], folder: Path, writer: Any) -> dict[str, list[Row]]:
+    """Print all tables, log them, draw the confusion matrices; the tables by name."""
+    tables = {
+        "suites": suite_table(scores),
+        "effects": effect_table(scores),
+        "marks": mark_table(scores),
+    }
+    texts = {name: format_table(rows) for name, rows in tables.items()}
+    print("\n\n".join(texts.values()))
+    for name, text in texts.items():
+        writer.add_text(name, f"```\n{text}\n```")
+    for row in tables["suites"]:
+        tag = f"{row['suite']}/{row['hidden'].replace(' ', '_')}"
+        writer.add_scalar(f"{tag}/exact", row["exact"])
+        writer.add_scalar(f"{tag}/wrong_name", row["wrong name"])
+    for suite in dict.fromkeys(score.suite for score in scores):
+        chosen = [score for score in scores if score.suite == suite]
+        write_text(folder / f"confusion-{suite}.csv", confusion_csv(chosen))
+        figure = confusion_figure(chosen, f"{suite}: {len(chosen)} runs")
+        save_figure(figure, folder / "figures", f"confusion-{suite}", writer)
+    return tables
+
+
+def suite_table(scores: Sequence[Score]) -> list[Row]:
+    """One row for each suite; clean cases of mixed suites have their own."""
+    table = []
+    for suite in (name for name in SUITES if any(s.suite == name for s in scores)):
+        for is_clean in (True, False):
+            chosen = [s for s in scores if s.suite == suite and (s.label == CLEAN) == is_clean]
+            if chosen:
+                table.append({"suite": suite, **_rates(chosen, is_clean)})
+    return table
+
+
+def effect_table(scores: Sequence[Score]) -> list[Row]:
+    """One row for each suite and what was hidden, with what it was mostly taken for."""
+    table = []
+    for suite, label in dict.fromkeys((s.suite, s.label) for s in scores):
+        chosen = [s for s in scores if (s.suite, s.label) == (suite, label)]
+        others = Counter(s.found for s in chosen if not s.is_exact).most_common(2)
+        count, runs = rate(chosen, lambda s: s.is_exact)
+        errors = median_interval([e for s in chosen for e in s.size_errors])
+        row: Row = {"suite": suite, "hidden": label, "runs": runs, "exact": count / runs}
+        row["90 %"] = _interval(count, runs)
+        row["size error"] = errors[0] if math.isfinite(errors[0]) else None
+        row["otherwise"] = ", ".join(f"{name} ({n})" for name, n in others) or None
+        table.append(row)
+    return table
+
+
+def confusion_csv(scores: Sequence[Score]) -> str:
+    """The confusion matrix, truths down and findings across."""
+    truths, columns, counts = confusion(scores)
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(["truth", *columns])
+    lines.writerows([truth, *row] for truth, row in zip(truths, counts, strict=True))
+    return text.getvalue()
+
+
+def confusion_figure(scores: Sequence[Score], heading: str) -> Figure:
+    """The confusion matrix as shares of each truth, with counts."""
+    truths, columns, counts = confusion(scores)
+    numbers = np.array(counts)
+    shares = numbers / numbers.sum(1, keepdims=True)
+    width, height = 3.0 + 0.32 * len(columns), 2.2 + 0.24 * len(truths)
+    figure, (panel,) = panels(1, 1, width, height)
+    panel.grid(False)
+    panel.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    panel.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
+    panel.set_yticks(range(len(truths)), truths)
+    panel.set_xlabel("verdict")
+    panel.set_ylabel("hidden")
+    for i, j in np.argwhere(numbers):
+        colour = "white" if shares[i, j] > 0.5 else "black"
+        panel.text(j, i, str(numbers[i, j]), ha="center", va="center", color=colour,
+                   fontsize=TEXT - 2)  # fmt: skip
+    title(panel, heading)
+    return figure
+
+
+def _rates(scores: Sequence[Score], is_clean: bool) -> Row:
+    count, runs = rate(scores, lambda s: s.is_exact)
+
+    def share(what: Any) -> float:
+        return rate(scores, what)[0] / runs
+
+    closed = median_interval([s.closed for s in scores])[0]
+    row: Row = {"hidden": "nothing" if is_clean else "effects", "runs": runs}
+    row |= {"exact": count / runs, "90 %": _interval(count, runs)}
+    row["within ambiguity"] = share(lambda s: s.is_within)
+    row["wrong name"] = share(is_falsely_named if is_clean else lambda s: s.is_wrong)
+    row["unknown"] = share(lambda s: s.verdict == "unknown_remains")
+    row["nothing"] = share(lambda s: s.verdict == "nothing_missing")
+    row["too little"] = share(lambda s: s.verdict == "not_enough_information")
+    row["failed"] = share(lambda s: s.verdict == "failed")
+    row["gap closed"] = closed if math.isfinite(closed) else None
+    row["seconds"] = median_interval([s.seconds for s in scores])[0]
+    return row
+
+
+def _interval(count: int, runs: int) -> str:
+    low, high = share_interval(count, runs)
+    return f"{low:.2f}-{high:.2f}"

@@ -1,0 +1,173 @@
+"""What each verdict is worth against the key, and how often over many.
+
+A diagnosis is exact where the effects it names are those hidden, no more and no fewer, and it
+claims that nothing else is missing; it may call them ambiguous. A diagnosis that failed is none of
+that. Shares have exact (Clopper-Pearson) 90 % intervals, medians those of order statistics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom, binomtest
+
+from eval.blind.cases import null_value
+from eval.blind.sealing import Seal, open_key
+from eval.blind.suites import PLACES
+
+NUMERICS = "numerics"
+"""The one name that stands for no physics."""
+LEVEL = 0.9
+FAILED: dict[str, Any] = {
+    "verdict": "failed",
+    "effects": [],
+    "alternatives": [],
+    "theta_after": [],
+    "share_closed": None,
+}
+
+
+@dataclass(frozen=True)
+class Score:
+    """One case, scored."""
+
+    suite: str
+    label: str
+    run: int
+    truth: tuple[str, ...]
+    verdict: str
+    names: tuple[str, ...]
+    """What was named, without numerics."""
+    is_exact: bool
+    is_within: bool
+    """Exact, or the truth is among the alternatives reported."""
+    is_wrong: bool
+    """Something else is named and the truth is not even among the alternatives."""
+    closed: float
+    """Share of the excess over the noise floor that is gone on fresh data: 0 where an effect is
+    hidden and none was named, NaN where there is no excess."""
+    size_errors: tuple[float, ...]
+    """Relative errors of the sizes of the effects, where exact."""
+    size_inside: tuple[bool, ...]
+    """Whether each 90 % interval of a parameter of an effect holds the truth, where exact."""
+    theta_scores: tuple[float, ...]
+    """Distances of theta from the truth in posterior deviations, where exact."""
+    seconds: float
+
+    @property
+    def found(self) -> str:
+        """The column of the confusion matrix."""
+        named = " + ".join(sorted(self.names))
+        if self.verdict == "unknown_remains" and named:
+            return f"{named} + unknown"
+        return named or self.verdict
+
+
+def score_verdicts(folder: Path, lines: Iterable[Mapping[str, Any]]) -> list[Score]:
+    """Open the keys, after all verdicts; raises `RunError` where one is not the sealed one."""
+    return [score_line(open_key(folder, seal_of(line)), line) for line in lines]
+
+
+def seal_of(line: Mapping[str, Any]) -> Seal:
+    """The seal in a line."""
+    return Seal(line["case"], line["key_sha256"], line["episodes_sha256"])
+
+
+def score_line(key: Mapping[str, Any], line: Mapping[str, Any]) -> Score:
+    """One verdict against its key."""
+    found = line.get("diagnosis", FAILED)
+    truth, verdict = tuple(sorted(key["hidden"])), found["verdict"]
+    names = _physical(effect["name"] for effect in found["effects"])
+    stands = verdict in (("named", "ambiguous") if truth else ("nothing_missing", "named"))
+    is_exact = stands and set(names) == set(truth)
+    offered = [set(_physical(one["names"])) for one in found["alternatives"]]
+    is_within = is_exact or (stands and set(truth) in offered)
+    errors, inside = _sizes(key["hidden"], found["effects"]) if is_exact else ([], [])
+    return Score(
+        suite=key["suite"],
+        label=key["label"],
+        run=key["run"],
+        truth=truth,
+        verdict=verdict,
+        names=names,
+        is_exact=is_exact,
+        is_within=is_within,
+        is_wrong=not is_within and not set(names) <= set(truth),
+        closed=0.0 if truth and not names else _number(found["share_closed"]),
+        size_errors=tuple(errors),
+        size_inside=tuple(inside),
+        theta_scores=tuple(_theta(key["theta"], found["theta_after"]) if is_exact else ()),
+        seconds=line["wall_s"] if "diagnosis" in line else math.nan,
+    )
+
+
+def rate(scores: Sequence[Score], what: Callable[[Score], bool]) -> tuple[int, int]:
+    """How many of how many."""
+    return sum(map(what, scores)), len(scores)
+
+
+def share_interval(count: int, runs: int) -> tuple[float, float]:
+    """Clopper-Pearson interval of a share; nothing is known without runs."""
+    if not runs:
+        return 0.0, 1.0
+    found = binomtest(int(count), int(runs)).proportion_ci(LEVEL, "exact")
+    return float(found.low), float(found.high)
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median and the interval of order statistics that holds it with 90 %; NaN without values."""
+    kept = np.sort([value for value in values if math.isfinite(value)])
+    if not len(kept):
+        return math.nan, math.nan, math.nan
+    first = int(binom.ppf((1 - LEVEL) / 2, len(kept), 0.5))
+    below = max(first - 1, 0)
+    return float(np.median(kept)), float(kept[below]), float(kept[len(kept) - 1 - below])
+
+
+def confusion(scores: Sequence[Score]) -> tuple[list[str], list[str], list[list[int]]]:
+    """Truths, findings and how often each truth was found as what; truths and equals first."""
+    counts = Counter((" + ".join(score.truth) or score.label, score.found) for score in scores)
+    truths = list(dict.fromkeys(truth for truth, _ in counts))
+    found = {finding for _, finding in counts}
+    columns = [truth for truth in truths if truth in found]
+    columns += sorted(found - set(columns))
+    return truths, columns, [[counts[truth, one] for one in columns] for truth in truths]
+
+
+def _physical(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if name != NUMERICS)
+
+
+def _sizes(
+    hidden: Mapping[str, Mapping[str, float]], effects: Iterable[Mapping[str, Any]]
+) -> tuple[list[float], list[bool]]:
+    errors, inside = [], []
+    for effect in effects:
+        if effect["name"] not in hidden:  # numerics
+            continue
+        for found in effect["parameters"]:
+            place = effect["name"], found["name"]
+            null = null_value(*place)[0]
+            true = hidden[effect["name"]].get(found["name"], null)
+            inside.append(_number(found["low"]) <= true <= _number(found["high"]))
+            if true != null and place not in PLACES:
+                errors.append(abs(_number(found["value"]) - true) / abs(true - null))
+    return errors, inside
+
+
+def _theta(true: Mapping[str, float], estimates: Iterable[Mapping[str, Any]]) -> list[float]:
+    return [
+        abs(one["value"] - true[one["name"]]) / max(_number(one["sd"]), 1e-12)
+        for one in estimates
+        if one["name"] in true
+    ]
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

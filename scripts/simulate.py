@@ -77,6 +77,8 @@ class Simulation:
     """World z of the floor instead of a random one [m]."""
     wall_position: float | None = None
     """World x of the wall instead of a random one [m]."""
+    effects: tuple[str, ...] = ()
+    """Effects that the truth has besides, as `floor_compliance.compliance=2e-4`, in SI units."""
     start: tuple[float, ...] = ()
     """Start pose x z phi instead of one 10 to 20 mm above the floor [m, m, rad]."""
     unit: Literal["m", "cm", "mm", "in", "px"] | None = None
@@ -99,6 +101,21 @@ class Simulation:
                 raise ValueError(f"{name} is {value:g}, expected {unit}; it looks like {likely}")
         if self.name is not None and (not self.name or Path(self.name).name != self.name):
             raise ValueError(f"name is {self.name!r}, expected a file name without a folder")
+
+    @property
+    def hidden(self) -> dict[str, dict[str, float]]:
+        """The effects with their parameters."""
+        found: dict[str, dict[str, float]] = {}
+        for text in self.effects:
+            path, _, value = text.partition("=")
+            effect, _, parameter = path.partition(".")
+            try:
+                found.setdefault(effect, {})[parameter] = float(value)
+            except ValueError as error:
+                raise ValueError(
+                    f"effects has {text!r}, expected EFFECT.PARAMETER=NUMBER"
+                ) from error
+        return found
 
     def _value(self, name: str) -> float | None:
         """A field, or the entry `start x`, `start z` or `start phi` of the start pose."""
@@ -143,7 +160,7 @@ def simulate(config: Simulation) -> None:
     sensor_std = torch.tensor(
         [position, position, angle, force, force, torque], dtype=torch.float64
     )
-    truth = make_truth(scene, config.truth)
+    truth = make_truth(scene, config.truth, config.hidden, config.steps)
     notes = f"simulated, truth {config.truth}, motion {config.policy}, seed {config.seed}"
     made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
     contents, lines = {}, []

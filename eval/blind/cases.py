@@ -121,17 +121,9 @@ def record_case(world: World, case: Case, seed: int, fresh: bool = False) -> Rec
 
 def make_hidden_truth(world: World, kind: str, steps: int) -> Truth:
     """A source of data of a world for a run of so many steps."""
-    scene = world.scene
-    if kind == "mujoco":
-        from tpcd.truth.injected import InjectedMujocoTruth
+    from tpcd.truth.scene import make_truth
 
-        return InjectedMujocoTruth(scene, world.hidden, steps)
-    from tpcd.effects.truth import EffectTruth, added_effects
-
-    return EffectTruth(
-        scene.vertices_ee, scene.friction, scene.floor_height, scene.wall_position,
-        scene.stiffness, added_effects(world.hidden), steps,
-    )  # fmt: skip
+    return make_truth(world.scene, kind, world.hidden, steps)
 
 
 def start_reading(

@@ -13,7 +13,6 @@ arm and of the sensors from all others.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -88,9 +87,12 @@ def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> 
         for channel in range(3):
             data, drawn = mean[:, channel], full[:, :, channel]
             if covariate == "size":
-                data, drawn = (data**2 - 1) / math.sqrt(2), (drawn**2 - 1) / math.sqrt(2)
-            score = float(weight @ data) / norm
-            largest = torch.maximum(largest, (drawn @ weight / norm).abs())
+                # The posterior's mean makes squares smaller; only large ones speak.
+                score = max(float(_size_score(data, weight)), 0.0)
+                scored = _size_score(drawn, weight).clamp_min(0.0)
+            else:
+                score, scored = float(weight @ data) / norm, drawn @ weight / norm
+            largest = torch.maximum(largest, scored.abs())
             rows = int((design != 0).sum())
             scores.append(Cell(mode, CHANNELS[channel], covariate, score, rows))
     scores.sort(key=lambda cell: -abs(cell.score))
@@ -133,6 +135,15 @@ def parity_score(history: History) -> tuple[float, float]:
     half = torch.tensor(freedom / 2.0, dtype=torch.float64)
     p = float(torch.special.gammaincc(half, square.sum() / 2))
     return float(square.mean()) / 3, p
+
+
+def _size_score(values: Tensor, weight: Tensor) -> Tensor:
+    """A sum of squares as a standard normal number (Wilson and Hilferty 1931)."""
+    square = weight**2
+    freedom = square.sum() ** 2 / (square**2).sum()
+    mean = (values**2 @ square) / square.sum()
+    spread = 2.0 / (9.0 * freedom)
+    return (mean ** (1.0 / 3.0) - (1.0 - spread)) / spread.sqrt()
 
 
 def _modes(outcome: Outcome) -> list[str]:

@@ -19,6 +19,8 @@ class Estimate:
     """Shape prior: a checkpoint folder, or the name of a shipped one such as ycb-rich."""
     out: Path
     """Folder for the results; a stopped run in it goes on with --resume."""
+    model: Path | None = None
+    """Model file with effects to estimate too, such as diagnose writes (docs/effects.md)."""
     estimator: Literal["default", "paper"] = "default"
     """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
     particles: int = 700
@@ -34,6 +36,8 @@ class Estimate:
 
     def __post_init__(self) -> None:
         check_numbers(self, least={"particles": 16}, above={"misfit": 0.0})
+        if self.model is not None and self.estimator == "paper":
+            raise ValueError("the estimator paper has a model of its own; leave --model out")
 
 
 def estimate_episode(config: Estimate) -> None:
@@ -47,6 +51,7 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import parameter_rows, run_estimation
+    from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
     from tpcd.commands.plausibility import check_start_pose
     from tpcd.data import check_episode, read_episode
     from tpcd.results import continue_run, format_table, run_folder, write_results
@@ -55,19 +60,22 @@ def estimate_episode(config: Estimate) -> None:
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
     episode = read_episode(config.episode)
+    model = model_of(config.model)
     shape = load_prior(config.prior)
     check_start_pose(episode, shape)
     for warning in check_episode(episode):
         print(f"warning: {warning}", file=sys.stderr)
     if config.resume:
-        # The state knows its data, so files may have been moved.
-        free = ("episode", "out", "resume", "overwrite")
+        check_kept_model(model, config.out)
+        # The state knows its data and the run its model, so files may have been moved.
+        free = ("episode", "model", "out", "resume", "overwrite")
         opened = nullcontext(continue_run(config.out, config, free))
     else:
         opened = run_folder(
             config.out, "scripts/estimate.py", config, config.overwrite, resumable=STATE_FILE
         )
     with opened as folder:
+        keep_model(model, folder, config.model)
         state = load_state(folder, episode)
         done = 0 if state is None else state.index
         generator = torch.Generator().manual_seed(config.seed)
@@ -77,7 +85,10 @@ def estimate_episode(config: Estimate) -> None:
             steps = estimate_paper(episode, shape, generator, state=state)
         else:
             settings = EstimatorSettings(
-                sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
+                sampler=SamplerSettings(particles=config.particles),
+                step=model.step,
+                misfit_sd=config.misfit,
+                effects=model.effects,
             )
             steps = estimate(episode, shape, generator, settings, state)
         belief = run_estimation(steps, episode, config.prior, folder, done=done)

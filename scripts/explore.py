@@ -53,6 +53,8 @@ class Exploration:
     """Lower corner of the workspace of commands [m, m, rad]."""
     workspace_high: tuple[float, float, float] = (1.0, 1.0, 0.15)
     """Upper corner of the workspace [m, m, rad]."""
+    model: Path | None = None
+    """Model file with effects to estimate too, such as diagnose writes (docs/effects.md)."""
     estimator: Literal["default", "paper"] = "default"
     """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
     truth: Literal["quasistatic", "mujoco"] = "mujoco"
@@ -72,6 +74,8 @@ class Exploration:
         )
         if self.stop_error is not None and self.task is None:
             raise ValueError("stop_error needs a task to predict; name an episode with --task")
+        if self.model is not None and self.estimator == "paper":
+            raise ValueError("the estimator paper has a model of its own; leave --model out")
         weighs = self.policy in ("active", "lookahead", "grid")
         if self.stop_gain is not None and not weighs:
             raise ValueError(f"stop_gain needs a policy that weighs commands, not {self.policy}")
@@ -89,10 +93,12 @@ def explore_object(config: Exploration) -> None:
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
+    from tpcd.belief import EstimatorSettings
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.belief.storage import load_belief
     from tpcd.commands.estimation import KnownTruth, parameter_rows
     from tpcd.commands.exploring import EPISODE_NAME, Stopping, run_exploration
+    from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
     from tpcd.data.episode import read_episode, write_together
     from tpcd.exploration import Estimator, explore
     from tpcd.policies import Limits, make_policy
@@ -108,6 +114,7 @@ def explore_object(config: Exploration) -> None:
     torch.set_num_threads(1)
     outline = find_outline(config.outline)
     scene = draw_scene(outline.name, outline.vertices, stream(config.seed, SCENE_STREAM))
+    model = model_of(config.model)
     shape = load_prior(config.prior)
     task = None if config.task is None else _task(config.task)
     limits = Limits(
@@ -121,13 +128,15 @@ def explore_object(config: Exploration) -> None:
     robot = SimulatedRobot(make_truth(scene, config.truth), scene, config.seed, notes=notes)
     policy = make_policy(config.policy, limits, scene, config.seed, task)
     if config.resume:
-        free = ("out", "resume", "overwrite", "steps", "stop_gain", "stop_error")
+        check_kept_model(model, config.out)
+        free = ("model", "out", "resume", "overwrite", "steps", "stop_gain", "stop_error")
         opened = nullcontext(continue_run(config.out, config, free))
     else:
         opened = run_folder(
             config.out, "scripts/explore.py", config, config.overwrite, resumable=STATE_FILE
         )
     with opened as folder:
+        keep_model(model, folder, config.model)
         path, episode, belief, state = folder / f"{EPISODE_NAME}.csv", None, None, None
         if config.resume and path.is_file():
             episode = read_episode(path)
@@ -140,9 +149,11 @@ def explore_object(config: Exploration) -> None:
         def save(rows: Episode) -> None:
             write_together(recording_contents(robot.recording(rows), scene, path))
 
+        settings = EstimatorSettings(step=model.step, effects=model.effects)
+        estimator = Estimator(shape, config.estimator, settings)
         steps = explore(
-            robot, policy, Estimator(shape, config.estimator), config.seed, episode, belief, state,
-            save, config.stop_gain or 0.0,
+            robot, policy, estimator, config.seed, episode, belief, state, save,
+            config.stop_gain or 0.0,
         )  # fmt: skip
         try:
             belief, episode, reason = run_exploration(

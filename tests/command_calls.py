@@ -36,6 +36,7 @@ def call(script: str, *arguments: str) -> int:
         "estimate": ("estimate_episode", "Estimate", ("episode",)),
         "explore": ("explore_object", "Exploration", ()),
         "fetch_ycb": ("fetch", "Fetching", ("folder",)),
+        "plan_diagnosis": ("plan_diagnosis", "Planning", ()),
         "predict": ("predict_episodes", "Predict", ("run", "episodes")),
     }[script]
     main, config = (getattr(module, name) for name in entry[:2])

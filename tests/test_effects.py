@@ -181,9 +181,7 @@ def test_lag_and_arm_friction_stop_short() -> None:
 
 def test_stiffness_error_shows_in_the_wrench() -> None:
     rows = run({"stiffness_error": {"log_ratio_z": 0.1}}, (0, -0.03, 0))
-    torch.testing.assert_close(
-        rows[0, 4], 3.0 * torch.tensor(0.1).double().exp(), rtol=1e-9, atol=0
-    )
+    torch.testing.assert_close(rows[0, 4], 3.0 * vector(0.1)[0].exp(), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,16 @@ class ModelError(FileError):
     """A model file, or a file of effects, that is missing or malformed."""
 
 
+class EffectError(TpcdError):
+    """An effect whose code fails or gives back what is no model."""
+
+    def __init__(self, name: str, problem: str, source: str | Path = "") -> None:
+        self.name = name
+        self.problem = problem
+        self.source = str(source)
+        super().__init__(f"effect {name!r}" + (f" of {source}" if source else "") + f" {problem}")
+
+
 class RunError(FileError):
     """A run folder that is missing, incomplete, or would be overwritten."""
 

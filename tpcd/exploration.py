@@ -36,6 +36,11 @@ class Estimator:
     paper: PaperSettings = field(default_factory=PaperSettings)
     """Of the paper's filter."""
 
+    def __post_init__(self) -> None:
+        """Refuse effects where they would be left out."""
+        if self.kind == "paper" and self.settings.effects:
+            raise ValueError("the estimator paper has a model of its own, without effects")
+
     def before(self, episode: Episode, generator: torch.Generator) -> Belief:
         """The belief before any transition."""
         if self.kind == "paper":

@@ -20,9 +20,9 @@ from tpcd.belief.misfit import misfit_rows
 from tpcd.belief.resampling import systematic_resample
 from tpcd.contact import ContactScene, column_scene, scene_from_parameters
 from tpcd.effects.conditions import Rows, sequence
-from tpcd.effects.simulate import SimulatedRows, simulate_rows
+from tpcd.effects.simulate import RowByRow, SimulatedRows, simulate_rows
 from tpcd.planar import wrap_angle
-from tpcd.simulator import StepStatus, simulate_step
+from tpcd.simulator import StepStatus, Transition, simulate_step
 
 CHANNELS = ("x", "z", "phi", "F_x", "F_z", "tau")
 """The predicted channels in order; units m, m, rad, N, N, N·m."""
@@ -268,35 +268,49 @@ class ContactPredictor:
     ) -> Float[Tensor, "samples n 6"]:
         """Draw whole trajectories: every particle follows its own poses, n steps long.
 
-        Each trajectory keeps one theta and one draw of its misfit field throughout. Raises
-        ValueError for a belief with effects, whose rollouts are not there yet.
+        Each trajectory keeps one theta, its effects and one draw of its misfit field throughout.
         """
-        if self._added.effects:
-            raise ValueError(
-                "a belief with effects predicts one step at a time only; leave --rollout out"
-            )
         chosen = torch.multinomial(self.weights, samples, replacement=True, generator=generator)
         scene = self._scene.gather(chosen)
         field = self._field_mean[chosen]
         if field.shape[-1]:
             noise = torch.randn(field.shape, generator=generator, dtype=torch.float64)
             field = field + (self._field_root[chosen] @ noise[..., None])[..., 0]
-        here = pose.double().expand(samples, 3)
+        pose, commands = pose.double(), commands.double()
         before = None if previous is None else previous.double()
-        steps = []
-        stiffness = self.belief.stiffness
-        for command in commands.double():
-            transition = simulate_step(
-                scene, here, command, stiffness, self.belief.step, previous=before
+        walk = None
+        if self._added.effects:
+            rest = pose if before is None else before
+            walk = RowByRow(
+                self._flat.gather(chosen),
+                torch.cat((rest[None], commands)),
+                self.belief.stiffness,
+                self._added[chosen],
+                self.belief.step,
+                pose,
             )
+        here, steps = pose.expand(samples, 3), []
+        stiffness = self.belief.stiffness
+        for row, command in enumerate(commands, start=1):
+            if walk is None:
+                transition = simulate_step(
+                    scene, here, command, stiffness, self.belief.step, previous=before
+                )
+            else:
+                found = walk.settle(row, here)
+                transition = Transition(**{n: v[:, 0] for n, v in vars(found.transition).items()})
             here = transition.pose
             rows, uncovered = misfit_rows(
                 self.belief.misfit, self._field_sd[chosen], here[..., 2], transition
             )
-            if rows.shape[-1]:
-                here = here + (rows @ field[..., None])[..., 0]
-            offset = here - command
-            offset = torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)
-            steps.append(torch.cat((here, stiffness * offset), dim=-1))
+            shift = (rows @ field[..., None])[..., 0] if rows.shape[-1] else torch.zeros_like(here)
+            here = here + shift
+            if walk is None:
+                offset = here - command
+                offset = torch.cat((offset[..., :2], wrap_angle(offset[..., 2:])), dim=-1)
+                wrench = stiffness * offset
+            else:
+                wrench = found.wrench[:, 0] + (found.matrix[:, 0] @ shift[..., None])[..., 0]
+            steps.append(torch.cat((here, wrench), dim=-1))
             before = command
         return torch.stack(steps, dim=1)

@@ -218,9 +218,13 @@ def read_json(path: str | Path) -> Any:
 def to_plain(value: Any, *, flagged: list[str] | None = None, place: str = "") -> Any:
     """Turn dataclasses, mappings, sequences, paths, arrays and tensors into plain values.
 
+    What has a `to_plain` of its own is asked for it.
     With a list `flagged`, numbers that are not finite become None and their place
     (`table[0].error`) is appended to it.
     """
+    own = getattr(value, "to_plain", None)
+    if callable(own) and not isinstance(value, type):
+        value = own()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -31,6 +31,7 @@ from tpcd.belief.state import EstimatorState
 from tpcd.belief.target import ContactTarget
 from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.episode import Episode
+from tpcd.effects.protocol import Effect
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
@@ -53,6 +54,8 @@ class EstimatorSettings:
     """How far the object turns until the outline error is another one [rad]."""
     least_misfit_sd: float = 1e-4
     """The median is never taken to be less than this [m]."""
+    effects: tuple[Effect, ...] = ()
+    """Effects that the model has besides, whose parameters are estimated with theta."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +124,7 @@ def estimate(
     explain a transition.
     """
     settings = settings or EstimatorSettings()
-    prior = make_prior(shape, episode.priors)
+    prior = make_prior(shape, episode.priors, settings.effects)
     history = history_of(episode)
     misfit = misfit_field(shape, settings)
     target = ContactTarget(prior, misfit, settings.step)
@@ -150,7 +153,7 @@ def prior_belief(
     Where none does, all of them.
     """
     settings = settings or EstimatorSettings()
-    prior = make_prior(shape, episode.priors)
+    prior = make_prior(shape, episode.priors, settings.effects)
     misfit = misfit_field(shape, settings)
     target = ContactTarget(prior, misfit, settings.step)
     score = target.sample(settings.sampler.particles, generator)

@@ -116,8 +116,8 @@ def outcome_of(steps: Steps, history: History) -> Outcome:
     """The settled rows: those of the transitions, and readings where none leads to a row."""
     m = len(steps.pose)
     pose = history.readings[:, :3].expand(m, -1, -1).clone()
-    stepped = history.used & (steps.contacts.isfinite().all(-1).all(-1).all(0))
-    pose[:, 1:] = torch.where(stepped[:, None], steps.pose, pose[:, 1:])
+    stepped = history.used & steps.contacts.isfinite().all(-1).all(-1)
+    pose[:, 1:] = torch.where(stepped[..., None], steps.pose, pose[:, 1:])
     mode, contacts = (
         torch.cat((torch.zeros_like(value[:, :1]), value), dim=1)
         for value in (steps.mode, steps.contacts.nan_to_num(0.0))

@@ -48,7 +48,7 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
             "format_version": FORMAT_VERSION,
             "names": list(belief.prior.names),
             "units": list(belief.prior.units),
-            "effects": effects_to_plain(belief.prior.effects),
+            "effects": effects_to_plain(belief.prior.effects, fingerprints=True),
             "prior": str(prior),
             "prior_sha256": prior_hash(prior),
             "misfit": asdict(belief.misfit),

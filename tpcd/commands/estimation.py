@@ -255,6 +255,21 @@ def _log_scalars(writer: Any, row: dict[str, Any], step: EstimationStep) -> None
         writer.add_scalar(f"std/{name}", float(std), step.index)
 
 
+def _shown(belief: Belief) -> tuple[list[str], list[str], Any]:
+    """Labels and units of the entries of theta without the latent, as figures show them, and
+    factors from SI units; effects choose their own units."""
+    prior = belief.prior
+    z, scene = prior.shape.latent_dim, prior.scene_dimension
+    labels, units = list(prior.names[z:scene]), list(prior.units[z:scene])
+    factors = [1.0] * len(labels)
+    for effect in prior.effects:
+        for parameter in effect.parameters:
+            labels.append(f"{effect.name}:\n{parameter.name}")
+            units.append(parameter.shown_unit or parameter.unit)
+            factors.append(parameter.shown_factor)
+    return labels, units, torch.tensor(factors).double().numpy()
+
+
 def draw_estimation(
     belief: Belief,
     history: list[dict[str, Any]],
@@ -270,15 +285,23 @@ def draw_estimation(
     `prefix` leads their names, `heading` is where TensorBoard shows them.
     """
     z = belief.prior.shape.latent_dim
-    names, units = belief.prior.names[z:], belief.prior.units[z:]
+    names = belief.prior.names[z:]
     columns = {
         key: torch.cat((before[None], torch.tensor([row[key] for row in history])))[:, z:].numpy()
         for key, before in zip(("mean", "low", "high"), prior_summary(belief), strict=True)
     }
-    known = None if truth is None else torch.tensor([truth.scene[name] for name in names]).numpy()
+    known = None
+    if truth is not None:
+        # A simulated scene says nothing of effects.
+        known = torch.tensor([truth.scene.get(name, math.nan) for name in names]).numpy()
     last = len(history)
+    labels, units, factors = _shown(belief)
     figure = estimation_progress(
-        torch.arange(last + 1).numpy(), **columns, names=names, units=units, truth=known
+        torch.arange(last + 1).numpy(),
+        **{key: column * factors for key, column in columns.items()},
+        names=labels,
+        units=units,
+        truth=known,
     )
     save_figure(figure, folder, f"{prefix}estimation", writer, last, heading)
     chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()

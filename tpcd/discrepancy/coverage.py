@@ -64,7 +64,7 @@ class Coverage:
 
     def missing(self, needs: Sequence[str]) -> list[str]:
         """Those of the needs that are not met."""
-        return [need for need in needs if self.counts.get(need, 0.0) < NEEDED[need]]
+        return [need for need in needs if self.counts.get(need, 0.0) < NEEDED.get(need, 1.0)]
 
 
 def coverage_of(episodes: Sequence[Episode]) -> Coverage:

@@ -23,6 +23,7 @@ from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
 from tpcd.belief.history import History
 from tpcd.belief.importance import draw_pool
 from tpcd.belief.misfit import MisfitField
+from tpcd.belief.modes import find_modes
 from tpcd.belief.pool import known_weights, truncate
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.resampling import systematic_resample
@@ -35,6 +36,8 @@ FIT_SAMPLER = SamplerSettings(particles=300, draws=2000, prior_draws=500)
 """Budget of one fit on one seed."""
 _REMEMBERED = 12
 """Places of an earlier fit that a new one starts from as well."""
+STAGES = (0.2, 0.5)
+"""Shares of the transitions on which modes are sought first."""
 TIED = 8.0
 """Seeds whose log evidence is so close to the best count alike."""
 _WITHIN = 2.5
@@ -106,8 +109,8 @@ def fit_model(
         generator = fit_stream(question, effects, seed)
         begin = start_cloud(target.sample(question.sampler.particles, generator))
         remembered = [carried(fit, prior, generator) for fit in start]
-        if remembered:
-            begin = replace(begin, modes=torch.cat(remembered))
+        remembered.append(_early_modes(target, question.sampler, generator))
+        begin = replace(begin, modes=torch.cat(remembered))
         pool = draw_pool(begin, target, 1, question.sampler, generator)
         weights = truncate(known_weights(pool.log_weights))
         index, counts = systematic_resample(weights, question.sampler.particles, generator).unique(
@@ -126,6 +129,23 @@ def fit_model(
             )
         )
     return Fit(effects, step, prior, tuple(by_seed), tuple(clouds))
+
+
+def _early_modes(
+    target: ContactTarget, sampler: SamplerSettings, generator: torch.Generator
+) -> Float[Tensor, "k s"]:
+    """Modes carried from a short history to longer ones: the first transitions leave fewer ways
+    to be stuck than all of them."""
+    assert target.history is not None
+    modes = torch.zeros(0, target.prior.dimension + 1, dtype=torch.float64)
+    if sampler.fresh_modes == 1:
+        return modes
+    for share in STAGES:
+        count = max(1, round(share * len(target.history)))
+        modes = find_modes(
+            target.given(target.history.first(count)), modes, sampler, generator
+        ).points
+    return modes
 
 
 def joined_fit(one: Fit, other: Fit) -> Fit:

@@ -1,7 +1,8 @@
 """A quick look at every candidate: the Laplace approximation of its evidence near the base fit.
 
 Points climb from where the base model arrived, with the effect at its null value and at draws
-from its prior. The best of them says which candidates deserve the full fit from the prior.
+from its prior, and a few from all over the prior, since without the effect the base model may have
+gone astray. The best of them says which candidates deserve the full fit.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ from tpcd.effects.protocol import Effect
 
 PLACES = 8
 """Places of the base fit from which points climb."""
-ROUNDS = 3
+ROUNDS = 4
+FRESH_ROUNDS = 2
+KEPT = 6
+"""Points from all over the prior that go on climbing."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +36,18 @@ class Glance:
     """Standard deviation there of each parameter of the effect, in SI units."""
 
 
-def glance(question: Question, base: Fit, effect: Effect) -> Glance:
-    """Climb to the modes of the base model's effects and one more."""
+def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
+    """Climb to the modes of the base model's effects and one more; `fresh` points set out from
+    all over the prior."""
     effects = (*base.effects, effect)
     prior = question.scene.with_effects(effects)
     target = ContactTarget(prior, question.misfit, base.step, question.history)
-    start = carried(base, prior, fit_stream(question, effects, 0), PLACES)
+    generator = fit_stream(question, effects, 0)
+    start = carried(base, prior, generator, PLACES)
+    if fresh:
+        begun, height = climb(target, target.scatter(fresh, generator), FRESH_ROUNDS)
+        best = height.topk(min(KEPT, fresh)).indices
+        start = torch.cat((start, begun[best]))
     points, height = climb(target, start, ROUNDS)
     best = height.topk(min(2, len(height))).indices
     _, information = target.curvature(points[best])

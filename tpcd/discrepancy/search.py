@@ -43,12 +43,17 @@ Result = TypeVar("Result")
 
 FEWEST_ROWS = 10
 """Transitions below which nothing is named."""
-WORTH_FITTING = {True: 0.0, False: -15.0}
+FRESH = {True: 8, False: 40}
+"""Points of a quick look that set out from all over the prior, where the model explains the data
+and where it does not."""
+WORTH_FITTING = {True: -2.0, False: -25.0}
 """Gain of the quick look from which a candidate gets a full fit at all: where the model explains
 the data as it is, and where it does not."""
 WITHIN = 15.0
 """Candidates whose gain is so close to the best get a second seed."""
 AMBIGUOUS = 3.0
+SURE = 25.0
+"""Gain from which blocks held out have no veto: their fits to fewer data are less sure than it."""
 FINAL_SEEDS = (20, 21)
 """Further seeds of the model that was found."""
 
@@ -189,7 +194,8 @@ class _Run:
             if effect not in excited:
                 lacks = ", ".join(self.coverage.missing(effect.needs))
                 self._note(effect.name, number, math.nan, (), f"not excited: {lacks}")
-        glances = self._each(excited, number, lambda effect: glance(self.question, current, effect))
+        fresh = FRESH[adequate] if self.settings.from_prior else 0
+        glances = self._each(excited, number, lambda e: glance(self.question, current, e, fresh))
         glances.sort(key=lambda g: -g.log_evidence)
         if number == 1 and pool is self.settings.catalogue:
             self.glances = glances
@@ -225,7 +231,7 @@ class _Run:
         gain = best.log_evidence - current.log_evidence
         accepted = gain >= self.settings.least_gain and min(best.by_seed) > current.log_evidence
         reason = f"gain {gain:.1f}"
-        if accepted:
+        if accepted and gain < SURE:
             own, base = (held_out_scores(self.question, fit) for fit in (best, current))
             bound = lower_bound(own - base, stream(self.settings.seed, 77, number))
             reason += f", held-out gain at least {bound:+.2f} a transition"
@@ -240,7 +246,7 @@ class _Run:
             Alternative(
                 fit.names,
                 fit.log_evidence - current.log_evidence,
-                "; or ".join(MOTIONS[need] for need in fit.effects[-1].needs),
+                "; or ".join(MOTIONS.get(need, need) for need in fit.effects[-1].needs),
             )
             for fit in near[1:]
             if fit.log_evidence > best.log_evidence - AMBIGUOUS

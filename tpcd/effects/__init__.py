@@ -1,12 +1,22 @@
 """Effects that a model may lack, each at its fixed site, and the catalogue of them."""
 
 from tpcd.effects.catalogue import CATALOGUE, find_effect
-from tpcd.effects.conditions import Conditions, Outcome, Rows, base_conditions, sequence
+from tpcd.effects.conditions import (
+    FLOOR,
+    WALL,
+    Conditions,
+    Outcome,
+    Rows,
+    base_conditions,
+    sequence,
+)
 from tpcd.effects.declare import DeclaredEffect
 from tpcd.effects.protocol import Added, Effect, EffectParameter, effect_parameters
 
 __all__ = [
     "CATALOGUE",
+    "FLOOR",
+    "WALL",
     "Added",
     "Conditions",
     "DeclaredEffect",

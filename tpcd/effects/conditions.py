@@ -29,9 +29,9 @@ class Rows:
     """The row that each one comes after; a first row comes after itself."""
     share: Float[Tensor, " r"]
     """How much of the run has passed, from 0 to 1."""
-    starts: Float[Tensor, "r 3"]
-    """Measured pose at the start of each row's transition, the end of the row it follows
-    [m, m, rad]."""
+    starts: Float[Tensor, "*#m r 3"]
+    """Pose at the start of each row's transition, the end of the row it follows [m, m, rad]:
+    the one that was measured, or in rollouts each particle's own."""
 
     def before(self, value: Float[Tensor, "m s *rest"]) -> Float[Tensor, "m s *rest"]:
         """The value at the row that each row follows."""

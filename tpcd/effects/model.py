@@ -11,7 +11,7 @@ A YAML file:
     step:                                # optional: settings of the step
       substeps: 4
 
-Reading a file with `file:` runs the Python code in it.
+Reading a file with `file:` runs the Python code in it; docs/effects.md says how to write one.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ import hashlib
 import importlib.util
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from tpcd.effects.catalogue import CATALOGUE, find_effect
-from tpcd.effects.protocol import SITES, Effect, EffectParameter
-from tpcd.errors import ModelError
+from tpcd.effects.check import check_effect
+from tpcd.effects.protocol import SITES, Effect, EffectParameter, effect_to_plain
+from tpcd.errors import EffectError, ModelError
 from tpcd.simulator.record import StepSettings
 
 
@@ -79,16 +80,16 @@ def write_model(model: Model, path: str | Path, notes: str | None = None) -> Pat
     return path
 
 
-def effects_to_plain(effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Effects with their priors in plain values, as in a model file."""
-    plain = []
-    for effect in effects:
-        one: dict[str, Any] = {"name": effect.name}
-        source = getattr(effect, "source", None)
-        if source:
-            one["file"] = str(source)
-        one["parameters"] = {p.name: [p.low, p.high] for p in effect.parameters}
-        plain.append(one)
+def effects_to_plain(effects: Sequence[Effect], fingerprints: bool = False) -> list[dict[str, Any]]:
+    """Effects with their priors in plain values, as in a model file.
+
+    With `fingerprints`, what files of effects hold now counts too: reading the effects back
+    fails where it has changed.
+    """
+    plain = [effect_to_plain(effect) for effect in effects]
+    for one in plain if fingerprints else []:
+        if "file" in one:
+            one["sha256"] = _sha256(Path(one["file"]))
     return plain
 
 
@@ -100,13 +101,16 @@ def effects_from_plain(plain: Any, path: Path) -> tuple[Effect, ...]:
     for entry in plain:
         if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
             raise ModelError(path, f"has the effect {entry!r}", "expected at least 'name: ...'")
-        if set(entry) - {"name", "file", "parameters"}:
+        if set(entry) - {"name", "file", "parameters", "sha256"}:
             raise ModelError(
                 path, f"has the effect {dict(entry)!r}", "expected name, file and parameters"
             )
         own: Iterable[Effect] = CATALOGUE
         if entry.get("file"):
-            own = load_effects(path.parent / str(entry["file"]))
+            file = path.parent / str(entry["file"])
+            own = load_effects(file)
+            if entry.get("sha256") not in (None, _sha256(file)):
+                raise ModelError(file, f"has changed since {path} was made", "estimate again")
         try:
             effect = find_effect(entry["name"], own)
             effects.append(_with_priors(effect, entry.get("parameters") or {}))
@@ -140,16 +144,42 @@ def load_effects(path: Path) -> tuple[Effect, ...]:
         raise ModelError(path, "holds no EFFECTS", "expected EFFECTS = (effect, ...)")
     for effect in effects:
         if not isinstance(effect, Effect):
-            raise ModelError(path, f"EFFECTS holds {effect!r}", "expected effects; see docs")
+            raise ModelError(
+                path, f"EFFECTS holds {effect!r}", "expected effects as docs/effects.md shows"
+            )
         if effect.site not in SITES:
-            raise ModelError(path, f"{effect.name!r} has the site {effect.site!r}", str(SITES))
+            raise ModelError(
+                path,
+                f"{effect.name!r} has the site {effect.site!r}",
+                f"expected one of {', '.join(SITES)}",
+            )
+        try:
+            check_effect(effect)
+        except EffectError as error:
+            raise ModelError(path, str(error), "see docs/effects.md") from error
         if not getattr(effect, "source", None):
             object.__setattr__(effect, "source", str(path))
+    names = [effect.name for effect in effects]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ModelError(path, f"EFFECTS holds {twice[0]!r} twice", "give each its own name")
     return tuple(effects)
 
 
-def _with_priors(effect: Effect, given: Mapping[str, Any]) -> Effect:
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _with_priors(effect: Effect, given: Any) -> Effect:
     """The effect with priors replaced by those that are given."""
+    if not given:
+        return effect
+    if not isinstance(given, Mapping):
+        raise ValueError(
+            f"parameters of {effect.name!r} are {given!r}, expected 'name: [low, high]'"
+        )
+    if not is_dataclass(effect):
+        raise ValueError(f"effect {effect.name!r} is no dataclass; set its priors in its file")
     names = [parameter.name for parameter in effect.parameters]
     for name in given:
         if name not in names:
@@ -160,10 +190,11 @@ def _with_priors(effect: Effect, given: Mapping[str, Any]) -> Effect:
         if ends is None:
             parameters.append(parameter)
             continue
-        if not isinstance(ends, list) or len(ends) != 2:
+        try:
+            low, high = (float(end) for end in ends)
+        except (TypeError, ValueError):
             raise ValueError(
                 f"prior of {effect.name}.{parameter.name} is {ends!r}, expected [low, high]"
-            )
-        low, high = (float(end) for end in ends)
+            ) from None
         parameters.append(replace(parameter, low=low, high=high))
     return replace(effect, parameters=tuple(parameters))  # type: ignore[type-var]

@@ -9,15 +9,18 @@ Write your own by giving an object these attributes; see docs/effects.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.effects.conditions import Conditions, Outcome, Rows
+from tpcd.effects.guard import known, malformed, set_apart, unusable
+from tpcd.errors import EffectError
 
 SITES = (
     "command",
@@ -30,6 +33,10 @@ SITES = (
     "sensor",
 )
 """Where effects act, in the order in which they are applied."""
+
+
+_TRIALS = 8
+"""Values of an effect's parameters that are tried before it counts as broken."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +56,12 @@ class EffectParameter:
     """What the SI value is multiplied by to be shown."""
 
     def __post_init__(self) -> None:
-        """Refuse a prior without width or a null value outside of it."""
-        if not self.low <= self.null <= self.high or not self.low < self.high:
+        """Refuse a prior without width."""
+        numbers = (self.low, self.high, self.null, self.shown_factor)
+        if not self.low < self.high or not all(math.isfinite(number) for number in numbers):
             raise ValueError(
                 f"parameter {self.name!r} has the range [{self.low}, {self.high}] and null value"
-                f" {self.null}; expected low < high with the null value between them"
+                f" {self.null}; expected finite numbers with low < high"
             )
 
 
@@ -61,14 +69,31 @@ class EffectParameter:
 class Effect(Protocol):
     """One effect of the catalogue, or of a user."""
 
-    name: str
-    site: str
-    parameters: tuple[EffectParameter, ...]
-    passes: int
-    """How often the step is solved anew with the effect's answer to its outcome; 0 where the
-    effect does not look at it."""
-    needs: tuple[str, ...]
-    """Names of the excitations (`discrepancy.coverage`) without which it cannot be seen."""
+    @property
+    def name(self) -> str:
+        """What models and reports call it."""
+        ...
+
+    @property
+    def site(self) -> str:
+        """Where it acts, one of `SITES`."""
+        ...
+
+    @property
+    def parameters(self) -> tuple[EffectParameter, ...]:
+        """Its p parameters in order."""
+        ...
+
+    @property
+    def passes(self) -> int:
+        """How often the step is solved anew with the effect's answer to its outcome; 0 where the
+        effect does not look at it."""
+        ...
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the excitations (`discrepancy.coverage`) without which it cannot be seen."""
+        ...
 
     def apply(
         self,
@@ -98,9 +123,13 @@ class Added:
         return max((effect.passes for effect in self.effects), default=0)
 
     def apply(self, conditions: Conditions, rows: Rows, outcome: Outcome | None) -> Conditions:
-        """The conditions with all effects, site by site."""
+        """The conditions with all effects, site by site.
+
+        Raises `EffectError` where one fails. A particle for which it gives no usable conditions
+        settles at NaN, and others are as without it.
+        """
         for effect, values in sorted(self._parts(), key=lambda part: SITES.index(part[0].site)):
-            conditions = effect.apply(conditions, values, rows, outcome)
+            conditions = _applied(effect, conditions, values, rows, outcome)
         return conditions
 
     def __getitem__(self, index: Tensor) -> Added:
@@ -110,6 +139,76 @@ class Added:
     def _parts(self) -> list[tuple[Effect, Tensor]]:
         sizes = [len(effect.parameters) for effect in self.effects]
         return list(zip(self.effects, self.values.split(sizes, dim=-1), strict=True))
+
+
+def _applied(
+    effect: Effect, before: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+) -> Conditions:
+    after = _tried(effect, before, values, rows, outcome)
+    bad = unusable(before, after)
+    if not bad:
+        return after
+    fine = known(before, values, rows, outcome)
+    first = next(iter(bad))
+    everywhere = torch.zeros(len(values), len(rows.share), dtype=torch.bool)
+    for part in bad.values():
+        everywhere = everywhere | part
+    if bool(fine.any()) and bool(everywhere.any(-1)[fine].all()):
+        _check_some_answer(effect, first, before, rows, outcome, int(fine.long().argmax()))
+    return set_apart(before, after, everywhere, rows)
+
+
+def _tried(
+    effect: Effect, before: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+) -> Conditions:
+    source = getattr(effect, "source", "")
+    try:
+        after = effect.apply(before, values, rows, outcome)
+    except Exception as error:
+        cause = " ".join(f"{type(error).__name__}: {error}".split())
+        raise EffectError(effect.name, f"fails with {cause[:300]}", source) from error
+    problem = malformed(before, after, len(values), len(rows.share))
+    if problem:
+        raise EffectError(effect.name, problem, source)
+    return after
+
+
+def _check_some_answer(
+    effect: Effect,
+    field: str,
+    before: Conditions,
+    rows: Rows,
+    outcome: Outcome | None,
+    particle: int,
+) -> None:
+    """Raise `EffectError` where an effect has no answer at all, whatever its parameters are."""
+    low, high = parameter_bounds([effect])
+    share = torch.linspace(0.0, 1.0, _TRIALS, dtype=torch.float64)[:, None]
+
+    def repeated(part: Tensor) -> Tensor:
+        return part[[particle if len(part) > 1 else 0] * _TRIALS]
+
+    before = Conditions(**{name: repeated(part) for name, part in vars(before).items()})
+    if outcome is not None:
+        outcome = Outcome(**{name: repeated(part) for name, part in vars(outcome).items()})
+    found = unusable(before, _tried(effect, before, low + share * (high - low), rows, outcome))
+    bad = sum((part.any(-1).long() for part in found.values()), torch.zeros(_TRIALS).long())
+    if bool((bad > 0).all()):
+        raise EffectError(
+            effect.name,
+            f"gives no usable {field} for any value of its parameters, expected finite numbers"
+            " (and a stiffness above 0)",
+            getattr(effect, "source", ""),
+        )
+
+
+def effect_to_plain(effect: Effect) -> dict[str, Any]:
+    """An effect in plain values, as in a model file."""
+    source = getattr(effect, "source", None)
+    plain: dict[str, Any] = {"name": effect.name}
+    if source:
+        plain["file"] = str(source)
+    return plain | {"parameters": {p.name: [p.low, p.high] for p in effect.parameters}}
 
 
 def effect_parameters(effects: Sequence[Effect]) -> tuple[EffectParameter, ...]:

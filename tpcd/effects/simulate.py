@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.contact import ContactScene
-from tpcd.effects.conditions import Conditions, Outcome, Rows, base_conditions
+from tpcd.effects.conditions import Conditions, Outcome, Rows, base_conditions, sequence
 from tpcd.effects.protocol import Added
 from tpcd.simulator import StepSettings, Transition, simulate_step
 
@@ -49,6 +49,58 @@ def simulate_rows(
         conditions = added.apply(base, rows, outcome)
         transition = _settle(scene, conditions, rows, index, settings)
         outcome = _outcome(transition, rows, index)
+    return _read(transition, conditions, index)
+
+
+class RowByRow:
+    """Rows one after the other, each settled from where the caller says, for m particles.
+
+    A row follows the one before; effects that look back see what truly happened to each particle.
+    """
+
+    def __init__(
+        self,
+        scene: ContactScene,
+        commands: Float[Tensor, "r 3"],
+        stiffness: Float[Tensor, " 3"],
+        added: Added,
+        settings: StepSettings,
+        start: Float[Tensor, " 3"],
+    ) -> None:
+        """All commands of the run; row 0 is the start pose [m, m, rad]."""
+        self._scene, self._added, self._settings = scene, added, settings
+        self._base = base_conditions(scene, commands, stiffness)
+        self._rows = sequence(start.expand(len(commands), 3))
+        self._first = added.apply(self._base, self._rows, None)
+        m, terrains = len(scene.friction), scene.friction.shape[-1]
+        contact = start.new_zeros(m, len(commands), terrains)
+        self._past = Outcome(
+            start.expand(m, len(commands), 3), contact.long(), contact, contact,
+            torch.stack((contact, contact), dim=-1),
+        )  # fmt: skip
+
+    def settle(self, row: int, start: Float[Tensor, "m 3"]) -> SimulatedRows:
+        """Settle the next row from the poses [m, m, rad] where the one before ended."""
+        index = torch.tensor([row])
+        here = index == torch.arange(len(self._rows.share))
+        starts = torch.where(here[:, None], start[:, None], self._past.pose)
+        rows = replace(self._rows, starts=starts)
+        conditions = self._first
+        for left in range(self._added.passes, -1, -1):
+            transition = _settle(self._scene, conditions, rows, index, self._settings)
+            now = _outcome(transition, rows, index)
+            parts = zip(vars(now).items(), vars(self._past).values(), strict=True)
+            seen = Outcome(
+                **{name: torch.where(_along(here, new), new, old) for (name, new), old in parts}
+            )
+            if left:
+                conditions = self._added.apply(self._base, rows, seen)
+        self._past = seen
+        return _read(transition, conditions, index)
+
+
+def _read(transition: Transition, conditions: Conditions, index: Tensor) -> SimulatedRows:
+    """What sensors read of the rows that settled."""
     give = _at(conditions.give, index)
     pose = transition.pose + give
     offset = pose - _at(conditions.command, index)
@@ -77,7 +129,7 @@ def _settle(
     target, turn = conditions.target, _pose(conditions.turn)
     transition = simulate_step(
         here,
-        rows.starts[index] + _at(turn, before),
+        rows.starts[..., index, :] + _at(turn, before),
         _at(target, index) + _at(turn, index),
         _at(conditions.stiffness, index),
         settings,
@@ -95,6 +147,11 @@ def _outcome(transition: Transition, rows: Rows, index: Tensor) -> Outcome:
     contacts = pose.new_zeros(m, len(rows.share), terrains, 4)
     contacts[:, index] = transition.contacts.nan_to_num(0.0)
     return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:])
+
+
+def _along(rows: Tensor, value: Tensor) -> Tensor:
+    """A mask of rows against values (m, r, ...)."""
+    return rows.reshape(1, -1, *[1] * (value.ndim - 2))
 
 
 def _at(value: Tensor, index: Tensor) -> Tensor:

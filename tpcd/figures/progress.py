@@ -30,8 +30,8 @@ def estimation_progress(
 ) -> Figure:
     """Draw mean and band [low, high] of d parameters over n steps, in SI units.
 
-    `names` and `units` are those of `tpcd.parameters` for the chosen columns. Raises
-    `ValueError` when their number is not d.
+    `names` and `units` are those of `tpcd.parameters` for the chosen columns; where `truth` is
+    NaN it is not drawn. Raises `ValueError` when their number is not d.
     """
     steps, mean, low, high = (np.asarray(value) for value in (steps, mean, low, high))
     if not len(names) == len(units) == mean.shape[1]:
@@ -48,9 +48,9 @@ def estimation_progress(
             steps, factor * low[:, i], factor * high[:, i], color=BELIEF, alpha=0.25, linewidth=0
         )
         (line,) = panel.plot(steps, factor * mean[:, i], color=BELIEF, linewidth=1.8)
-        handles = {"mean of the belief": line, "90 % interval": band}
-        if truth is not None:
-            value = factor * float(np.asarray(truth)[i])
+        handles |= {"mean of the belief": line, "90 % interval": band}
+        value = math.nan if truth is None else factor * float(np.asarray(truth)[i])
+        if math.isfinite(value):
             handles["truth"] = panel.axhline(value, color=TRUTH, linestyle="--", linewidth=1.2)
         panel.set_ylabel(axis_label(name, unit))
         panel.set_xlabel("step")

@@ -41,6 +41,7 @@ def diagnose_episodes(config: Diagnose) -> int:
     Returns 0 where nothing is missing, 10 to 14 for the other verdicts in the order named,
     ambiguous, formula, unknown remains, not enough information.
     """
+    import math
     import sys
     from dataclasses import replace
 
@@ -74,7 +75,7 @@ def diagnose_episodes(config: Diagnose) -> int:
                 "before": gap.before,
                 "after": gap.after,
                 "noise": gap.noise_floor,
-                "closed": gap.closed,
+                "closed": f"{gap.closed:.0%}" if math.isfinite(gap.closed) else "no excess",
             }
             for gap in found.gap
         ]

@@ -33,6 +33,7 @@ def call(script: str, *arguments: str) -> int:
     module = load_script(script)
     entry = {
         "simulate": ("simulate", "Simulation", ()),
+        "diagnose": ("diagnose_episodes", "Diagnose", ("episodes",)),
         "estimate": ("estimate_episode", "Estimate", ("episode",)),
         "explore": ("explore_object", "Exploration", ()),
         "fetch_ycb": ("fetch", "Fetching", ("folder",)),

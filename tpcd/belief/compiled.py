@@ -60,8 +60,7 @@ def compiled_filter(
     rows = (merged.poses, merged.variance, conditions.give.expand(-1, n + 1, -1), rest)
     seen = max(len(value) for value in rows)
     poses, variance, shift, rest = (value.expand(seen, *value.shape[1:]) for value in rows)
-    # One angle tells which bumps act: of the reading, which effects hardly move.
-    values, slopes = field.basis(merged.poses[0, 1:, 2])
+    values, slopes = field.basis(setting.angles)
     measured = Measured(
         *(part.contiguous().numpy() for part in (poses, variance, shift, values, slopes, rest)),
         least.contiguous().numpy(),

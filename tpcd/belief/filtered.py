@@ -90,9 +90,7 @@ def filter_history(
         )
         pose = transition.pose - ends
         residual = angle_difference(merged.poses[:, k + 1] - _row(conditions.give, k + 1), pose)
-        # As in compiled loops, one angle tells which bumps act.
-        angle = merged.poses[0, k + 1, 2]
-        rows, uncovered = misfit_rows(field, sd, angle, transition)
+        rows, uncovered = misfit_rows(field, sd, setting.angles[k], transition)
         usable = (transition.status <= int(StepStatus.RELAXED)) & finite
         usable = usable & torch.isfinite(residual).all(-1)
         # What is not usable must not reach a factorisation.

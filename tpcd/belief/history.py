@@ -100,7 +100,7 @@ class History:
     def setting(self, scene: ContactScene) -> Setting:
         """The history as it is without effects, for the scenes of m particles."""
         conditions = base_conditions(scene, self.commands, self.stiffness)
-        return Setting(conditions, self.merged, self.used)
+        return Setting(conditions, self.merged, self.used, self.settled[:, 2])
 
     def first(self, count: int) -> History:
         """The first transitions only."""

@@ -98,7 +98,7 @@ def effective_setting(
     def after(outcome: Outcome | None) -> Setting:
         conditions = added.apply(base.conditions, rows, outcome)
         merged = merge(history.readings, history.sensor_variance, conditions)
-        return Setting(conditions, merged, history.used)
+        return replace(base, conditions=conditions, merged=merged)
 
     setting = after(None)
     for _ in range(added.passes):
@@ -127,7 +127,9 @@ def outcome_of(steps: Steps, history: History) -> Outcome:
 
 def highest_terms(history: History) -> Float[Tensor, " n"]:
     """What the log density of each transition's residual cannot exceed, whatever theta is."""
-    return Setting(history.bare, history.merged, history.used).highest_terms[0]
+    return Setting(history.bare, history.merged, history.used, history.settled[:, 2]).highest_terms[
+        0
+    ]
 
 
 def _spread(part: HistoryLikelihood, index: Tensor, count: int) -> HistoryLikelihood:

@@ -97,6 +97,9 @@ class Setting:
     merged: Merged
     used: Bool[Tensor, " n"]
     """Transitions that count; the others part the history."""
+    angles: Float[Tensor, " n"]
+    """Angles of the object that tell which bumps of the misfit act [rad]: of the readings without
+    effects, the same for all particles."""
 
     @property
     def highest_terms(self) -> Float[Tensor, "c n"]:
@@ -110,4 +113,5 @@ class Setting:
         def pick(part: Conditions | Merged) -> dict[str, Tensor]:
             return {n: v if len(v) == 1 else v[index] for n, v in vars(part).items()}
 
-        return Setting(Conditions(**pick(self.conditions)), Merged(**pick(self.merged)), self.used)
+        conditions, merged = Conditions(**pick(self.conditions)), Merged(**pick(self.merged))
+        return Setting(conditions, merged, self.used, self.angles)

@@ -122,7 +122,9 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[lis
         was, now, least = (part[rows].mean(-2) for part in (*squares, floor))
         excess = was - least
         share = (was - torch.maximum(now, least)) / excess
-        return torch.where(excess > LEAST_EXCESS * least, share, torch.nan)
+        # Below this, chance alone makes an excess.
+        chance = max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / n))
+        return torch.where(excess > chance * least, share, torch.nan)
 
     whole, resampled = closed(torch.arange(n)), closed(draws)
     found = []

@@ -1,0 +1,101 @@
+"""scripts/diagnose.py: what it writes, its exit codes, and runs side by side."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_calls import PRIOR, call
+
+from tpcd.discrepancy.coverage import NEEDED
+from tpcd.discrepancy.diagnosis import (
+    Candidate,
+    Cell,
+    Diagnosis,
+    Estimate,
+    Gap,
+    Limit,
+    NamedEffect,
+)
+
+
+def a_diagnosis() -> Diagnosis:
+    """A soft floor, named."""
+    size = Estimate("compliance", 2e-4, 1e-5, 1.8e-4, 2.2e-4, "m/N", "2.00 ± 0.10 mm per 10 N")
+    cells = tuple(Cell("floor, stick", channel, "mean", 1.5, 9) for channel in ("x", "z", "phi"))
+    return Diagnosis(
+        "named",
+        "the floor yields 2.00 ± 0.10 mm per 10 N",
+        effects=(NamedEffect("floor_compliance", (size,), "the floor yields"),),
+        candidates=(
+            Candidate("floor_compliance", 1, 30.0, (1.0, 2.0), "accepted: gain 30.0"),
+            Candidate("adhesion", 1, float("nan"), (), "not excited: lift-off"),
+        ),
+        gap=(Gap("z", "m", 4e-4, 2e-4, 2e-4, 1.0, 0.9, 1.0),),
+        share_closed=0.95,
+        held_out="fresh episodes",
+        cells_before=cells,
+        cells_after=cells,
+        unexplained_before=0.1,
+        unexplained_after=0.0,
+        theta_before=(Estimate("friction", 0.3, 0.01, 0.28, 0.32, "1"),),
+        theta_after=(Estimate("friction", 0.32, 0.02, 0.29, 0.35, "1"),),
+        detection_limits=(Limit("adhesion", "force", float("inf"), "none", "needs lift-off"),),
+        coverage=dict.fromkeys(NEEDED, 1.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An episode too short for a diagnosis."""
+    folder = tmp_path_factory.mktemp("short")
+    words = ("--outline", "mug", "--truth", "quasistatic", "--policy", "diagnosis", "--steps", "6")
+    assert call("simulate", *words, "--name", "a", "--out", str(folder)) == 0
+    return folder
+
+
+def test_too_little_data_has_a_verdict_and_an_exit_code_of_its_own(
+    world: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = world / "run"
+    words = (str(world / "a.csv"), "--prior", PRIOR, "--out", str(out))
+    assert call("diagnose", *words) == 14
+    assert "verdict: not enough information: 6 transitions" in capsys.readouterr().out
+    verdict = json.loads((out / "verdict.json").read_text())
+    assert verdict["verdict"] == "not_enough_information" and verdict["effects"] == []
+    assert "not enough information" in (out / "report.html").read_text()
+    assert (out / "config.yaml").is_file() and (out / "versions.json").is_file()
+    assert call("diagnose", "--compare", str(out), str(out)) == 0
+    assert capsys.readouterr().out.count("not enough information") == 2
+
+
+def test_bad_input_is_one_line(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    episode = str(world / "a.csv")
+    for words, expected in (
+        ((), "give episodes to diagnose, or runs to --compare"),
+        ((episode, "--model", str(world / "none.yaml")), "none.yaml: no such file"),
+        (("--compare", str(world)), "verdict.json: no such file"),
+    ):
+        assert call("diagnose", *words, "--out", str(world / "bad")) == 2
+        error = capsys.readouterr().err.strip()
+        assert expected in error and "\n" not in error
+    assert not (world / "bad").exists()
+
+
+def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:
+    from torch.utils.tensorboard import SummaryWriter
+
+    from tpcd.commands.diagnosing import draw_diagnosis, write_diagnosis
+    from tpcd.figures.sinks import save_figure
+
+    found = a_diagnosis()
+    figures = draw_diagnosis(found, [], 6.0)
+    assert set(figures) == {"residuals", "evidence", "gap", "theta"}
+    for name, (figure, caption) in figures.items():
+        assert caption and save_figure(figure, tmp_path, name).stat().st_size > 5000
+    with SummaryWriter(tmp_path / "tensorboard") as writer:
+        page = write_diagnosis(found, [], 6.0, PRIOR, tmp_path, writer).read_text()
+    for text in ("2.00 ± 0.10 mm per 10 N", "95 % of the excess", "needs lift-off", "30.0"):
+        assert text in page
+    assert "http" not in page.replace("http-equiv", "")

@@ -112,11 +112,12 @@ def draw_diagnosis(
     if rows:
         drawn["residuals"] = (
             residual_map(
-                _mean_cells(diagnosis.cells_before),
-                _mean_cells(diagnosis.cells_after),
+                _largest_scores(diagnosis.cells_before),
+                _largest_scores(diagnosis.cells_after),
                 sorted(rows.items(), key=lambda row: (row[0] != "all", row[0])),
             ),
-            "What the models leave, by contact mode and channel (number of transitions).",
+            "What the models leave, by contact mode (number of transitions) and channel: the"
+            " largest score of residuals' mean, size, or slope with load, place, angle or time.",
         )
     tried = [c for c in diagnosis.candidates if math.isfinite(c.gain) and c.round == 1]
     if tried:
@@ -170,8 +171,14 @@ def render_page(
     )
 
 
-def _mean_cells(cells: Sequence[Cell]) -> list[tuple[str, str, float]]:
-    return [(c.mode, c.channel, c.score) for c in cells if c.covariate == "mean"]
+def _largest_scores(cells: Sequence[Cell]) -> list[tuple[str, str, float]]:
+    """The largest score of every mode and channel, whatever it goes with."""
+    largest: dict[tuple[str, str], float] = {}
+    for cell in cells:
+        key = (cell.mode, cell.channel)
+        if abs(cell.score) > abs(largest.get(key, 0.0)):
+            largest[key] = cell.score
+    return [(*key, score) for key, score in largest.items()]
 
 
 def _stretch(diagnosis: Diagnosis, episode: Episode) -> Figure:

@@ -24,7 +24,7 @@ CellRow = tuple[str, str, float]
 def residual_map(
     before: Sequence[CellRow], after: Sequence[CellRow], rows: Sequence[tuple[str, int]]
 ) -> Figure:
-    """Scores of the mean residual by contact mode and channel, before and after.
+    """Largest scores of residuals by contact mode and channel, before and after.
 
     `rows` are the contact modes with their numbers of transitions, from top to bottom.
     """
@@ -50,7 +50,7 @@ def residual_map(
         panel.grid(False)
         title(panel, heading)
     assert image is not None
-    figure.colorbar(image, ax=axes, label="mean residual [standard deviations]", shrink=0.9)
+    figure.colorbar(image, ax=axes, label="largest score [standard deviations]", shrink=0.9)
     return figure
 
 

@@ -56,12 +56,12 @@ def _script(history: History, generator: torch.Generator) -> Script:
     for visit in (
         [corner(MEDIUM, MEDIUM), climb(MEDIUM), wall_slide(DOWN, MEDIUM)],
         _free_visit(PLACES[1], side),
-        [above(PLACES[1]), *_press_at_loads(press), nudge(RIGHT, HARD)],
+        [above(PLACES[1]), *_press_at_loads(press), lean(RIGHT, HARD), nudge(RIGHT, HARD)],
         [tilt(side), tilt(-side, HARD), slide(LEFT, HARD), slide(RIGHT, HARD), pause, peel],
         [facing_wall, *_press_at_loads(wall_press)],
         [wall_slide(UP, HARD), wall_slide(DOWN, HARD), pause],
         [wall_slide(UP, LIGHT), wall_slide(DOWN, LIGHT), wall_tilt(side), wall_tilt(-side)],
-        [wall_peel, above(PLACES[0]), press(MEDIUM), nudge(LEFT, MEDIUM)],
+        [wall_peel, above(PLACES[0]), press(MEDIUM), lean(LEFT, MEDIUM), nudge(LEFT, MEDIUM)],
         [slide(LEFT, LIGHT), slide(RIGHT, LIGHT), above(PLACES[2]), press(MEDIUM)],
         [corner(MEDIUM, MEDIUM), corner(MEDIUM, HARD, side)],
         [*_free_visit(PLACES[0], -side), press(MEDIUM), peel],
@@ -131,6 +131,16 @@ def slide(direction: float, load: float) -> Move:
 
     def move(felt: Feel) -> Command:
         reach = SLIDE + felt.floor_friction * load / felt.stiffness[0]
+        return felt.x + direction * reach, _down(felt, load), 0.0
+
+    return move
+
+
+def lean(direction: float, load: float) -> Move:
+    """Along the floor with less than friction holds, which only moves what yields."""
+
+    def move(felt: Feel) -> Command:
+        reach = 0.7 * felt.floor_friction * load / felt.stiffness[0]
         return felt.x + direction * reach, _down(felt, load), 0.0
 
     return move

@@ -20,6 +20,8 @@ class Diagnose:
     """Shape prior: a checkpoint folder, or the name of a shipped one."""
     model: Path | None = None
     """Model file with effects that are already known."""
+    candidates: tuple[Path, ...] = ()
+    """Python files with effects of your own to try besides the catalogue (docs/effects.md)."""
     fresh: tuple[Path, ...] = ()
     """Episodes of the same set-up that only measure the gap; without them blocks are held out."""
     seed: int = 0
@@ -51,7 +53,7 @@ def diagnose_episodes(config: Diagnose) -> int:
     from tpcd.commands.diagnosing import EXIT_CODES, compare_runs, write_diagnosis
     from tpcd.data import check_episode, read_episode
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
-    from tpcd.effects.model import Model, load_model
+    from tpcd.effects.model import Model, load_effects, load_model
     from tpcd.results import format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
@@ -66,7 +68,9 @@ def diagnose_episodes(config: Diagnose) -> int:
             print(f"warning: {warning}", file=sys.stderr)
     shape = load_prior(config.prior)
     model = Model() if config.model is None else load_model(config.model)
+    own = [effect for path in config.candidates for effect in load_effects(path)]
     settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
+    settings = replace(settings, catalogue=(*settings.catalogue, *own))
     with run_folder(config.out, "scripts/diagnose.py", config, config.overwrite) as folder:
         found = diagnose(episodes, shape, settings, fresh, model.effects, tell=_tell)
         rows = [

@@ -75,6 +75,7 @@ def test_bad_input_is_one_line(world: Path, capsys: pytest.CaptureFixture[str]) 
     for words, expected in (
         ((), "give episodes to diagnose, or runs to --compare"),
         ((episode, "--model", str(world / "none.yaml")), "none.yaml: no such file"),
+        ((episode, "--candidates", str(world / "none.py")), "none.py: no such file"),
         (("--compare", str(world)), "verdict.json: no such file"),
     ):
         assert call("diagnose", *words, "--out", str(world / "bad")) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 from dataclasses import asdict, dataclass, replace
@@ -28,7 +27,6 @@ from tpcd.random import stream
 from tpcd.truth.injected_effects import active_effects
 
 SEED = 10000
-HAS_SEARCH = importlib.util.find_spec("tpcd.discrepancy.search") is not None
 
 
 def same(a: Episode, b: Episode) -> bool:
@@ -386,7 +384,6 @@ def test_bad_settings_are_refused(wrong: dict) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not HAS_SEARCH, reason="the workflow is not there")
 def test_the_workflow_itself_gives_a_verdict(tmp_path: Path) -> None:
     from eval.blind.trial import run_case
 

@@ -21,12 +21,11 @@ from tpcd.discrepancy.report_parts import shown_value
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.effects import find_effect
 from tpcd.effects.protocol import EffectParameter
-from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene
+from tpcd.truth.scene import draw_scene, make_truth
 
 SMALL = DiagnosisSettings(
     sampler=SamplerSettings(
@@ -40,17 +39,8 @@ SMALL = DiagnosisSettings(
 def recorded(hidden: dict[str, dict[str, float]], steps: int = 30, seed: int = 5) -> Episode:
     generator = torch.Generator().manual_seed(seed)
     scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
-    truth = EffectTruth(
-        scene.vertices_ee,
-        scene.friction,
-        scene.floor_height,
-        scene.wall_position,
-        scene.stiffness,
-        added_effects(hidden),
-        steps,
-    )
+    truth = make_truth(scene, "quasistatic", hidden, steps)
     motion = make_motion("diagnosis", scene, steps, generator)
-    truth.reset(scene.start_pose)
     return record(truth, scene, motion, steps, generator).measured
 
 

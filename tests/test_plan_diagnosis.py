@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tpcd.data import read_episode
 from tpcd.data.episode import Episode
+from tpcd.discrepancy.coverage import MOTIONS, coverage_of
 from tpcd.simulator import QuasistaticTruth
 from tpcd.truth.diagnosis_plan import Planned, diagnosis_plan
 from tpcd.truth.motions import FORCE_LIMIT, LARGEST_TILT
@@ -66,9 +67,8 @@ def test_forces_stay_within_the_limit(
 def test_a_plan_excites_what_a_diagnosis_needs(
     plan: list[Planned], off: tuple[float, float]
 ) -> None:
-    coverage = pytest.importorskip("tpcd.discrepancy.coverage")
-    found = coverage.coverage_of([followed(plan, 0.5, off[0], 0.15 + off[1])])
-    assert found.missing(list(coverage.MOTIONS)) == []
+    found = coverage_of([followed(plan, 0.5, off[0], 0.15 + off[1])])
+    assert found.missing(list(MOTIONS)) == []
 
 
 def test_purposes_say_what_happens(plan: list[Planned]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -56,11 +56,19 @@ def folds(history: History, count: int = FOLDS) -> list[Bool[Tensor, " n"]]:
 def held_out_scores(question: Question, fit: Fit) -> Float[Tensor, " n"]:
     """Log predictive density of every transition that counts, fitted without its block."""
     scores = torch.zeros(len(question.history), dtype=torch.float64)
-    for k, mask in enumerate(folds(question.history)):
-        part = replace(question, history=question.history.using(~mask), sampler=FOLD_SAMPLER)
-        trained = fit_model(part, fit.effects, (100 + k,), start=(fit,), step=fit.step)
+    for mask, _, trained in _fold_fits(question, fit):
         scores[mask] = _predictive(question, trained)[mask]
     return scores[question.history.used]
+
+
+def _fold_fits(question: Question, fit: Fit) -> Iterator[tuple[Tensor, Question, Fit]]:
+    """The transitions held out in each fold, what is asked of the others, and the fit to them.
+
+    The search starts from the fit of all data; the weights of its draws see the others alone.
+    """
+    for k, mask in enumerate(folds(question.history)):
+        part = replace(question, history=question.history.using(~mask), sampler=FOLD_SAMPLER)
+        yield mask, part, fit_model(part, fit.effects, (100 + k,), start=(fit,), step=fit.step)
 
 
 def lower_bound(
@@ -100,9 +108,7 @@ def prediction_errors(question: Question, fit: Fit, episodes: Sequence[Episode])
 def held_out_errors(question: Question, fit: Fit, episodes: Sequence[Episode]) -> Errors:
     """Prediction errors of every transition, by a model fitted without its block."""
     errors, noises = [], []
-    for k, mask in enumerate(folds(question.history)):
-        part = replace(question, history=question.history.using(~mask), sampler=FOLD_SAMPLER)
-        trained = fit_model(part, fit.effects, (100 + k,), start=(fit,), step=fit.step)
+    for mask, part, trained in _fold_fits(question, fit):
         found = prediction_errors(part, trained, episodes)
         rows = mask[~question.history.seams]
         errors.append(found.error[rows])

@@ -1,0 +1,163 @@
+"""The admittance law and its detectors against a surface behind a delay."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tpcd.robot.admittance import (
+    AdmittanceSettings,
+    advance,
+    at_rest,
+    residual,
+    settings_for_surface,
+)
+from tpcd.robot.settling import SettlingSettings, Window
+
+STIFFNESS = (100.0, 100.0, 50.0)
+STEP = 0.002
+DELAY = 17
+"""Cycles of 2 ms: 34 ms."""
+
+
+def press(
+    settings: AdmittanceSettings,
+    surface: float,
+    command_z: float,
+    start_z: float = 0.01,
+    seconds: float = 40.0,
+    noise: float = 0.2,
+) -> tuple[float | None, np.ndarray, bool]:
+    """Press on a spring [N/m] at z = 0 through a delayed servo; when it settled, forces, and
+    whether the detector called it unstable."""
+    generator = np.random.default_rng(1)
+    window = Window(SettlingSettings(), np.array([noise, noise, 0.01]))
+    state = at_rest(np.array([0.0, start_z, 0.0]), np.zeros(3))
+    command = np.array([0.0, command_z, 0.0])
+    queue = [start_z] * DELAY
+    forces = []
+    for count in range(int(seconds / STEP)):
+        z = queue.pop(0)
+        force = max(0.0, -surface * z)
+        forces.append(force)
+        measured = np.array([0.0, force, 0.0]) + generator.normal(0, (noise, noise, 0.01))
+        state = advance(settings, state, command, measured, STEP)
+        queue.append(float(state.reference[1]))
+        pose = np.array([state.reference[0], z, state.reference[2]])
+        window.add(count * STEP, pose, measured, residual(settings, state, command))
+        if count % 25 == 0:
+            if window.still() is not None:
+                return count * STEP, np.array(forces), False
+            if window.unstable():
+                return None, np.array(forces), True
+    return None, np.array(forces), False
+
+
+@pytest.mark.parametrize("surface", [3e3, 5e3, 10e3])
+def test_tiles_settle_within_four_seconds_at_the_spring_s_force(surface: float) -> None:
+    settings = settings_for_surface(STIFFNESS, surface)
+    time, forces, unstable = press(settings, surface, -0.03)
+    assert not unstable and time is not None and time < 4.0
+    # K (u + F / k) = F
+    expected = 100 * 0.03 / (1 + 100 / surface)
+    assert forces[-100:].mean() == pytest.approx(expected, abs=0.1)
+
+
+def test_a_bare_table_settles_within_fifteen_seconds() -> None:
+    time, _, unstable = press(settings_for_surface(STIFFNESS, 5e4), 5e4, -0.03)
+    assert not unstable and time is not None and time < 15.0
+
+
+@pytest.mark.parametrize("surface", [3e3, 1e4])
+def test_too_little_damping_is_unstable_and_detected(surface: float) -> None:
+    settings = settings_for_surface(STIFFNESS, surface, damping_time=0.012, free_time=0.012)
+    _, forces, unstable = press(settings, surface, -0.04)
+    assert unstable and len(forces) * STEP < 3.0
+
+
+@pytest.mark.parametrize("command_z", [-0.002, -0.005, -0.008])
+def test_a_light_contact_is_no_limit_cycle(command_z: float) -> None:
+    """Forces under the touch threshold: the lighter damping alone would be unstable there."""
+    time, _, unstable = press(settings_for_surface(STIFFNESS, 5e3), 5e3, command_z)
+    assert not unstable and time is not None and time < 6.0
+
+
+@pytest.mark.parametrize("surface", [3e3, 1e4, 5e4])
+def test_the_first_touch_stays_within_its_force(surface: float) -> None:
+    settings = settings_for_surface(STIFFNESS, surface, impact_force=4.0)
+    _, forces, _ = press(settings, surface, -0.03, start_z=0.03, noise=0.0)
+    assert forces.max() < 3.0 + 4.0
+
+
+def test_the_bound_of_the_delayed_integrator_is_where_it_turns_unstable() -> None:
+    """k T / D against pi / 2, in the linear law: contact throughout, no filter, no limit."""
+    surface, delay = 5e3, DELAY * STEP
+
+    def last_swing(ratio: float) -> float:
+        damping = surface * delay / ratio
+        settings = AdmittanceSettings(
+            STIFFNESS, (damping,) * 3, (damping,) * 3, (1e3,) * 3, filter_time=1e-9
+        )
+        state = at_rest(np.array([0.0, -0.001, 0.0]), np.zeros(3))
+        queue = [-0.001] * DELAY
+        swing = []
+        for _ in range(3000):
+            z = queue.pop(0)
+            # Both signs: a spring that also pulls keeps the loop linear.
+            state = advance(settings, state, np.zeros(3), np.array([0.0, -surface * z, 0.0]), STEP)
+            queue.append(float(state.reference[1]))
+            swing.append(z)
+        return float(np.abs(swing[-300:]).max())
+
+    assert last_swing(0.9 * math.pi / 2) < 1e-4
+    assert last_swing(1.15 * math.pi / 2) > 1e-2
+
+
+def test_free_motion_reaches_the_command_without_passing_it() -> None:
+    settings = settings_for_surface(STIFFNESS, 5e3)
+    state = at_rest(np.zeros(3), np.zeros(3))
+    command = np.array([0.05, -0.02, 0.1])
+    for _ in range(3000):
+        state = advance(settings, state, command, np.zeros(3), STEP)
+        assert (np.abs(state.velocity) <= np.array(settings.speed_limit) + 1e-12).all()
+        assert (state.reference * np.sign(command) <= np.abs(command) + 1e-12).all()
+    np.testing.assert_allclose(state.reference, command, atol=1e-6)
+
+
+def test_a_late_reading_never_throws_the_arm_past_the_command() -> None:
+    settings = settings_for_surface(STIFFNESS, 1e3, largest_speed=100.0, impact_force=1e9)
+    state = at_rest(np.zeros(3), np.zeros(3))
+    state = advance(settings, state, np.array([0.01, 0.0, 0.0]), np.zeros(3), 5.0)
+    assert 0 < state.reference[0] < 0.01
+
+
+def test_noise_alone_is_neither_motion_nor_oscillation() -> None:
+    """1000 windows of noise: at 4 standard deviations on 9 means, under 1 % false alarms."""
+    generator = np.random.default_rng(0)
+    noise = np.array([0.3, 0.3, 0.02])
+    still = 0
+    for _ in range(200):
+        window = Window(SettlingSettings(), noise)
+        for count in range(80):
+            drawn = generator.normal(0, 1, 3) * noise
+            pose = generator.normal(0, (2e-5, 2e-5, 5e-5))
+            window.add(count * 0.008, pose, drawn, drawn)
+        assert not window.unstable()
+        still += window.still() is not None
+    assert still >= 196
+
+
+def test_a_slow_approach_is_not_still() -> None:
+    window = Window(SettlingSettings(), np.full(3, 1e-3))
+    for count in range(80):
+        pose = np.array([1e-3 * count * 0.008, 0.0, 0.0])
+        window.add(count * 0.008, pose, np.zeros(3), np.zeros(3))
+    assert window.still() is None
+
+
+@pytest.mark.parametrize("surface", [0.0, -1.0, float("nan")])
+def test_a_surface_without_stiffness_is_refused(surface: float) -> None:
+    with pytest.raises(ValueError, match="surface_stiffness"):
+        settings_for_surface(STIFFNESS, surface)

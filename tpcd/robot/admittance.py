@@ -1,0 +1,153 @@
+"""The admittance law: how an arm that follows positions is made to behave like a spring.
+
+    D v = K (u - r) + w
+
+r is the reference (x, z, phi) given to the arm's position servo, u the command, w the filtered
+wrench that the world exerts on the object, v the velocity of r. At rest w = K (r - u), which is
+the impedance of the episodes. All is a pure function of state and readings; SI units, poses and
+wrenches in the task's world frame.
+
+The arm follows after a servo delay T, so that in contact with a surface of stiffness k the loop is
+the integrator (k / D) exp(-s T): stable for k T / D < pi / 2, without overshoot for k T / D < 1 / e
+(K. J. Åström and R. M. Murray, Feedback Systems, chapter 10, phase margin of an integrator with
+delay). Damping of 0.04 s times the surface stiffness keeps the delays of servo, filter and
+sampling (about 50 ms) inside the first bound. In the air nothing is stiff and the same damping
+would only cost time: there the arm moves with a lighter one, slow enough that the first touch,
+which takes one delay to be felt, stays within a stated force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+DAMPING_TIME = 0.04
+"""Damping over surface stiffness [s]."""
+REACTION_TIME = 0.05
+"""From touching to the arm being slowed down: servo, filter and sampling [s]."""
+LEVER = 0.2
+"""Damping of the angle is that of a surface point so far from the end effector [m]. Larger than a
+hand-held object, since flat faces are stiffer against turning than single points."""
+
+
+@dataclass(frozen=True)
+class AdmittanceSettings:
+    """The spring, and how fast the arm gives way; on the axes x, z, phi."""
+
+    stiffness: tuple[float, float, float]
+    """Diagonal of K [N/m, N/m, N·m/rad]."""
+    damping: tuple[float, float, float]
+    """Diagonal of D in contact [N·s/m, N·s/m, N·m·s/rad]."""
+    free_damping: tuple[float, float, float]
+    """Diagonal of D in the air, in the same units."""
+    speed_limit: tuple[float, float, float]
+    """Largest speed of the reference on each axis [m/s, m/s, rad/s]."""
+    touch: tuple[float, float, float] = (1.0, 1.0, 0.1)
+    """A wrench beyond this is contact [N, N, N·m]."""
+    release: float = 0.005
+    """Contact is over once nothing was felt for this way [m]; shorter, and a light contact would
+    turn the lighter damping on and off."""
+    filter_time: float = 0.005
+    """Time constant of the filter of the wrench [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no spring."""
+        for name in ("stiffness", "damping", "free_damping", "speed_limit", "touch"):
+            if not all(value > 0 for value in getattr(self, name)):
+                raise ValueError(f"{name} is {getattr(self, name)}, expected positive numbers")
+
+
+def settings_for_surface(
+    stiffness: tuple[float, float, float],
+    surface_stiffness: float,
+    impact_force: float = 4.0,
+    largest_speed: float = 0.05,
+    damping_time: float = DAMPING_TIME,
+    free_time: float = 0.2,
+) -> AdmittanceSettings:
+    """Settings for surfaces up to a stiffness [N/m]; raises ValueError unless it is positive.
+
+    `impact_force` [N] is what the first touch may add at full speed, `largest_speed` [m/s] a bound
+    whatever the surface, `free_time` [s] the time constant D / K in the air.
+    """
+    if not surface_stiffness > 0:
+        raise ValueError(f"surface_stiffness is {surface_stiffness}, expected N/m above 0")
+    linear = damping_time * surface_stiffness
+    damping = np.array([linear, linear, linear * LEVER**2])
+    free = np.minimum(damping, free_time * np.array(stiffness))
+    speed = min(largest_speed, impact_force / (surface_stiffness * REACTION_TIME))
+    return AdmittanceSettings(
+        stiffness=stiffness,
+        damping=_three(damping),
+        free_damping=_three(free),
+        speed_limit=(speed, speed, speed / (LEVER / 2)),
+    )
+
+
+@dataclass(frozen=True)
+class AdmittanceState:
+    """Where the law stands between two readings."""
+
+    reference: Float[np.ndarray, " 3"]
+    """Target of the position servo [m, m, rad]."""
+    velocity: Float[np.ndarray, " 3"]
+    """Of the reference [m/s, m/s, rad/s]."""
+    wrench: Float[np.ndarray, " 3"]
+    """Filtered [N, N, N·m]."""
+    touched_at: Float[np.ndarray, " 3"] | None = None
+    """The last reference at which a contact was felt, while it counts."""
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the damping is that of contact."""
+        return self.touched_at is not None
+
+
+def at_rest(pose: Float[np.ndarray, " 3"], wrench: Float[np.ndarray, " 3"]) -> AdmittanceState:
+    """The state of an arm that stands at a pose [m, m, rad] with a wrench [N, N, N·m]."""
+    return AdmittanceState(pose.astype(float), np.zeros(3), wrench.astype(float))
+
+
+def residual(
+    settings: AdmittanceSettings, state: AdmittanceState, command: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 3"]:
+    """K (u - r) + w [N, N, N·m]: what still moves the arm, zero once it has settled."""
+    offset = command - state.reference
+    offset[2] = np.remainder(offset[2] + np.pi, 2 * np.pi) - np.pi
+    return np.array(settings.stiffness) * offset + state.wrench
+
+
+def advance(
+    settings: AdmittanceSettings,
+    state: AdmittanceState,
+    command: Float[np.ndarray, " 3"],
+    wrench: Float[np.ndarray, " 3"],
+    step: float,
+) -> AdmittanceState:
+    """The state after a reading of the wrench, `step` seconds after the last one.
+
+    The step is implicit in the spring, so that a late reading makes the arm slow and never
+    throws it past the command.
+    """
+    share = step / (settings.filter_time + step)
+    filtered = state.wrench + share * (wrench - state.wrench)
+    touched_at = state.touched_at
+    if bool((np.abs(filtered) > settings.touch).any()):
+        touched_at = state.reference
+    elif touched_at is not None:
+        way = state.reference - touched_at
+        if float(np.hypot(way[0], way[1])) > settings.release:
+            touched_at = None
+    damping = np.array(settings.free_damping if touched_at is None else settings.damping)
+    force = residual(settings, replace(state, wrench=filtered), command)
+    velocity = force / (damping + step * np.array(settings.stiffness))
+    limit = np.array(settings.speed_limit)
+    velocity = velocity * min(1.0, float((limit / np.maximum(np.abs(velocity), 1e-12)).min()))
+    return AdmittanceState(state.reference + step * velocity, velocity, filtered, touched_at)
+
+
+def _three(values: np.ndarray) -> tuple[float, float, float]:
+    x, z, angle = values.tolist()
+    return x, z, angle

@@ -1,0 +1,115 @@
+"""When an arm has settled, and when its force control has gone unstable.
+
+Both look at a window of recent readings. A sample is taken once pose and wrench no longer move
+and nothing is left that would move them, however long that takes. A loop that is unstable with a
+delayed surface shows an oscillation of the wrench that does not die out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class SettlingSettings:
+    """What counts as still; forces in N, torque in N·m, lengths in m, angles in rad."""
+
+    window: float = 0.6
+    """Length of the window [s]."""
+    pose_change: tuple[float, float, float] = (5e-5, 5e-5, 2e-4)
+    """Largest difference between the mean poses of the window's halves."""
+    wrench_change: tuple[float, float, float] = (0.08, 0.08, 0.004)
+    """The same of the wrench, on top of what its noise makes."""
+    residual: tuple[float, float, float] = (0.08, 0.08, 0.008)
+    """Largest mean of K (u - x) + w over the window, on top of its noise."""
+    noise_factor: float = 4.0
+    """Standard deviations of a mean that noise may account for."""
+    oscillation: float = 1.0
+    """Oscillation of a force, as standard deviation, that is not noise [N]; of a torque a tenth."""
+    crossings: int = 6
+    """Changes of sign in a window that make an oscillation."""
+
+
+@dataclass(frozen=True)
+class Still:
+    """Mean over a window in which nothing moved."""
+
+    pose: Float[np.ndarray, " 3"]
+    wrench: Float[np.ndarray, " 3"]
+    start: float
+    """Stamp of its first reading [s]."""
+    end: float
+    """Stamp of its last reading [s]."""
+    count: int
+    """Readings in it."""
+
+
+class Window:
+    """The readings of the last moments; `noise` is the standard deviation of one wrench reading
+    [N, N, N·m]."""
+
+    def __init__(self, settings: SettlingSettings, noise: Float[np.ndarray, " 3"]) -> None:
+        self.settings, self._noise = settings, noise
+        self._rows: deque[np.ndarray] = deque()
+
+    def add(
+        self,
+        stamp: float,
+        pose: Float[np.ndarray, " 3"],
+        wrench: Float[np.ndarray, " 3"],
+        residual: Float[np.ndarray, " 3"],
+    ) -> None:
+        """Append a reading and drop what is older than the window; stamps [s] must grow."""
+        self._rows.append(np.concatenate(([stamp], pose, wrench, residual)))
+        while stamp - float(self._rows[0][0]) > self.settings.window:
+            self._rows.popleft()
+
+    @property
+    def full(self) -> bool:
+        """Whether the readings cover the window."""
+        rows = self._rows
+        return len(rows) > 8 and float(rows[-1][0] - rows[0][0]) > 0.9 * self.settings.window
+
+    def still(self) -> Still | None:
+        """The means, if pose and force are steady and nothing is left to move them."""
+        if not self.full:
+            return None
+        rows, settings = np.array(self._rows), self.settings
+        half = len(rows) // 2
+        change = np.abs(rows[half:].mean(0) - rows[:half].mean(0))
+        noise = settings.noise_factor * self._noise
+        if (change[1:4] > settings.pose_change).any():
+            return None
+        if (change[4:7] > settings.wrench_change + noise * np.sqrt(2 / half)).any():
+            return None
+        left = np.abs(rows[:, 7:10].mean(0))
+        if (left > settings.residual + noise / np.sqrt(len(rows))).any():
+            return None
+        mean = rows.mean(0)
+        return Still(mean[1:4], mean[4:7], float(rows[0, 0]), float(rows[-1, 0]), len(rows))
+
+    def unstable(self) -> bool:
+        """Whether the wrench oscillates and does not die out."""
+        if not self.full:
+            return False
+        rows, settings = np.array(self._rows), self.settings
+        stamps, wrench = rows[:, 0] - rows[0, 0], rows[:, 4:7]
+        line = np.polynomial.polynomial.polyfit(stamps, wrench, 1)
+        swing = wrench - np.polynomial.polynomial.polyval(stamps, line).T
+        half = len(rows) // 2
+        before, after = swing[:half].std(0), swing[half:].std(0)
+        least = np.array([1.0, 1.0, 0.1]) * settings.oscillation
+        large = after > np.maximum(least, settings.noise_factor * self._noise)
+        # Noise on a slow swing crosses zero often too; it must have got clearly past it.
+        outside = np.where(np.abs(swing) > 0.5 * swing.std(0), np.sign(swing), 0.0)
+        crossings = np.array([_sign_changes(column) for column in outside.T])
+        return bool((large & (after > 0.8 * before) & (crossings >= settings.crossings)).any())
+
+
+def _sign_changes(signs: np.ndarray) -> int:
+    signs = signs[signs != 0]
+    return int((signs[1:] != signs[:-1]).sum())

@@ -58,3 +58,7 @@ class RunError(FileError):
 
 class SolverError(TpcdError):
     """A solver engine that is not installed or cannot handle the request."""
+
+
+class RobotError(TpcdError):
+    """An arm that cannot be used, or that had to be stopped."""

@@ -20,14 +20,16 @@ class SettlingSettings:
 
     window: float = 0.6
     """Length of the window [s]."""
-    pose_change: tuple[float, float, float] = (5e-5, 5e-5, 2e-4)
+    pose_change: tuple[float, float, float] = (1e-4, 1e-4, 2e-4)
     """Largest difference between the mean poses of the window's halves."""
     wrench_change: tuple[float, float, float] = (0.08, 0.08, 0.004)
     """The same of the wrench, on top of what its noise makes."""
-    residual: tuple[float, float, float] = (0.08, 0.08, 0.008)
-    """Largest mean of K (u - x) + w over the window, on top of its noise."""
+    residual: tuple[float, float, float] = (0.03, 0.03, 0.005)
+    """Largest mean of K (u - r) + w over the window. Divided by K it is how far the arm may still be
+    from rest where it slides or hangs free, so no noise is added to it: with more noise it only
+    takes longer."""
     noise_factor: float = 4.0
-    """Standard deviations of a mean that noise may account for."""
+    """Standard deviations of a difference of means that noise may account for."""
     oscillation: float = 1.0
     """Oscillation of a force, as standard deviation, that is not noise [N]; of a torque a tenth."""
     crossings: int = 6
@@ -87,7 +89,7 @@ class Window:
         if (change[4:7] > settings.wrench_change + noise * np.sqrt(2 / half)).any():
             return None
         left = np.abs(rows[:, 7:10].mean(0))
-        if (left > settings.residual + noise / np.sqrt(len(rows))).any():
+        if (left > settings.residual).any():
             return None
         mean = rows.mean(0)
         return Still(mean[1:4], mean[4:7], float(rows[0, 0]), float(rows[-1, 0]), len(rows))

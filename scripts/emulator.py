@@ -1,0 +1,70 @@
+"""Emulate a Universal Robots controller on loopback, with an object in its hand.
+
+python scripts/emulator.py --address 127.0.0.2 --outline mug --surface_mm_per_10n 2
+python scripts/robot.py --robot 127.0.0.2 --out runs/rehearsal      # in another shell
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from tpcd.cli import check_numbers, run
+from tpcd.robot.emulator.settings import EmulatorSettings
+
+
+@dataclass(frozen=True)
+class Emulation(EmulatorSettings):
+    """Settings of the command; SI units."""
+
+    address: str = "127.0.0.2"
+    """Loopback address to listen on; another one for each emulator at a time."""
+    truth: Path | None = None
+    """YAML file in which to write what the arm does not know."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, least={"fault_after": 0.0})
+        super().__post_init__()
+
+
+def emulate(config: Emulation) -> None:
+    """Emulate a controller (dashboard, script upload, RTDE) and the world behind it, until
+    Ctrl-C."""
+    import sys
+
+    import torch
+    import yaml
+
+    from tpcd.results import check_target, write_text
+    from tpcd.robot.emulator import emulated_scene
+    from tpcd.robot.emulator.server import Server
+
+    torch.set_num_threads(1)
+    if not config.address.startswith("127."):
+        raise ValueError(f"address is {config.address}, expected a loopback address 127.x.y.z")
+    if config.truth is not None:
+        check_target(config.truth)
+    settings = EmulatorSettings(
+        **{field.name: getattr(config, field.name) for field in fields(EmulatorSettings)}
+    )
+    server = Server(settings)
+    scene = emulated_scene(settings)
+    if config.truth is not None:
+        content = {
+            "theta": scene.theta,
+            "outline": {"name": scene.outline_name, "vertices": scene.outline_vertices.tolist()},
+            "start_pose": scene.start_pose.tolist(),
+            "compliance": settings.compliance,
+        }
+        write_text(config.truth, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    print(
+        f"{scene.outline_name} over a floor that yields {settings.surface_mm_per_10n:g} mm at"
+        f" 10 N, on {settings.address}, fault {settings.fault}; Ctrl-C ends it",
+        file=sys.stderr,
+        flush=True,
+    )
+    server.run()
+
+
+if __name__ == "__main__":
+    run(emulate, Emulation)

@@ -27,7 +27,8 @@ from tpcd.data.checks import (
     check_rows,
     check_steps,
 )
-from tpcd.data.header import Header, encode_header, parse_header, read_header
+from tpcd.data.header import ESTIMATE_NOISE, Header, encode_header, parse_header, read_header
+from tpcd.data.measured import NoCommandsError
 from tpcd.data.table import Table, encode_table, read_table
 from tpcd.errors import EpisodeError
 
@@ -108,12 +109,21 @@ def read_episode(path: str | Path) -> Episode:
     Raises `EpisodeError` with one line that names file, row, column, what was found, what
     is expected and what to do.
     """
-    table_path, header_path = _locate(Path(path))
+    table_path, header_path = locate(Path(path))
     return read_rows(table_path, read_header(header_path))
 
 
 def read_rows(table_path: Path, header: Header) -> Episode:
-    """The table of an episode whose YAML has been read; raises as `read_episode` does."""
+    """The table of an episode whose YAML has been read; raises as `read_episode` does.
+
+    A recording without set points raises `NoCommandsError`.
+    """
+    if not header.commands_known:
+        raise NoCommandsError(table_path)
+    if header.sensor_std is None:
+        raise EpisodeError(
+            _add(_stem(table_path), ".yaml"), "key sensor_std is missing", ESTIMATE_NOISE
+        )
     table = read_table(table_path, COLUMNS)
     check_steps(table_path, table["step"])
     commands, poses, wrenches = (
@@ -229,7 +239,7 @@ def write_together(contents: dict[Path, bytes | None], overwrite: bool = True) -
             temporary.unlink(missing_ok=True)
 
 
-def _locate(path: Path) -> tuple[Path, Path]:
+def locate(path: Path) -> tuple[Path, Path]:
     """Table and header of the episode that `path` names."""
     if path.is_dir():
         names = sorted(

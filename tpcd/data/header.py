@@ -1,8 +1,10 @@
 """The YAML beside an episode: stiffness, sensor noise and what else is known of the scene.
 
-Keys: `stiffness` [N/m, N/m, N·m/rad] and `sensor_std` (x, z [m], phi [rad], F_x, F_z [N],
-tau [N·m]) are required; `object`, `notes`, `time_step_s` [s] and `priors` (name of a scene
-parameter to [low, high], SI) are optional; anything else is refused with a hint.
+Keys: `stiffness` [N/m, N/m, N·m/rad] is required, and so is `sensor_std` (x, z [m], phi [rad],
+F_x, F_z [N], tau [N·m]) but for a diagnosis, which can estimate it; `object`, `notes`,
+`time_step_s` [s] and `priors` (name of a scene parameter to [low, high], SI) are optional, and
+`commands: unknown` marks a recording without set points (see `measured`); anything else is
+refused with a hint.
 """
 
 from __future__ import annotations
@@ -18,8 +20,7 @@ import yaml
 from tpcd.errors import EpisodeError
 from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
 
-REQUIRED_KEYS = ("stiffness", "sensor_std")
-OPTIONAL_KEYS = ("object", "notes", "time_step_s", "priors")
+KEYS = ("stiffness", "sensor_std", "object", "notes", "time_step_s", "priors", "commands")
 SENSOR_NAMES = ("x", "z", "phi", "F_x", "F_z", "tau")
 ESTIMATE_NOISE = (
     "hold the arm still without contact, record for about 10 s and give the standard deviation"
@@ -37,11 +38,14 @@ class Header:
     """What the YAML of an episode says, in SI units."""
 
     stiffness: tuple[float, ...]
-    sensor_std: tuple[float, ...]
+    sensor_std: tuple[float, ...] | None
+    """None where the YAML does not say."""
     object: str | None
     notes: str | None
     time_step_s: float | None
     priors: dict[str, tuple[float, float]]
+    commands_known: bool = True
+    """False where the set points were not recorded."""
 
 
 def read_header(path: Path) -> Header:
@@ -85,56 +89,45 @@ def parse_header(content: Any, path: Path) -> Header:
     if not isinstance(content, dict):
         found = "an empty file" if content is None else type(content).__name__
         raise EpisodeError(path, f"found {found}, expected keys", "give stiffness and sensor_std")
-    known = (*REQUIRED_KEYS, *OPTIONAL_KEYS)
     for key in content:
-        _check_known(path, "key", str(key), known)
-    for key in REQUIRED_KEYS:
-        if key not in content:
-            remedy = ESTIMATE_NOISE if key == "sensor_std" else "e.g. stiffness: [100, 100, 50]"
-            raise EpisodeError(path, f"key {key} is missing", remedy)
+        _check_known(path, "key", str(key), KEYS)
+    if "stiffness" not in content:
+        raise EpisodeError(path, "key stiffness is missing", "e.g. stiffness: [100, 100, 50]")
     stiffness = _numbers(path, "stiffness", content["stiffness"], 3, "[N/m, N/m, N·m/rad]")
     for axis, value in zip(("x", "z", "phi"), stiffness, strict=True):
         if value <= 0:
             raise EpisodeError(
                 path, f"stiffness of {axis} is {value:g}, expected > 0", "give the controller's K"
             )
-    sensor_std = _numbers(
-        path, "sensor_std", content["sensor_std"], 6, "[x, z, phi, F_x, F_z, tau]", ESTIMATE_NOISE
-    )
-    for name, value in zip(SENSOR_NAMES, sensor_std, strict=True):
-        if value < 0:
-            raise EpisodeError(
-                path, f"sensor_std of {name} is {value:g}, expected >= 0", ESTIMATE_NOISE
-            )
-        largest, unit, likely = LARGEST_NOISE.get(name, (math.inf, "", ""))
-        if value > largest:
-            raise EpisodeError(
-                path,
-                f"sensor_std of {name} is {value:g}, expected {unit} (at most {largest:g}); it"
-                f" looks like {likely}",
-                f"give it in {unit}",
-            )
+    sensor_std = _sensor_std(path, content["sensor_std"]) if "sensor_std" in content else None
     time_step = content.get("time_step_s")
     if time_step is not None:
         time_step = _number(path, "time_step_s", time_step)
         if time_step <= 0:
             raise EpisodeError(path, f"time_step_s is {time_step:g}, expected > 0", "give seconds")
+    commands = content.get("commands", "known")
+    if commands not in ("known", "unknown"):
+        raise EpisodeError(
+            path, f"commands is {commands!r}, expected known or unknown", "they stand in the table"
+        )
     return Header(
         stiffness=tuple(stiffness),
-        sensor_std=tuple(sensor_std),
+        sensor_std=sensor_std,
         object=_text(path, "object", content.get("object")),
         notes=_text(path, "notes", content.get("notes")),
         time_step_s=time_step,
         priors=_priors(path, content.get("priors")),
+        commands_known=commands == "known",
     )
 
 
 def encode_header(header: Header) -> bytes:
     """Content of NAME.yaml; floats keep every bit, keys that say nothing are left out."""
-    content: dict[str, Any] = {
-        "stiffness": list(header.stiffness),
-        "sensor_std": list(header.sensor_std),
-    }
+    content: dict[str, Any] = {"stiffness": list(header.stiffness)}
+    if header.sensor_std is not None:
+        content["sensor_std"] = list(header.sensor_std)
+    if not header.commands_known:
+        content["commands"] = "unknown"
     for key in ("object", "notes", "time_step_s"):
         if getattr(header, key) is not None:
             content[key] = getattr(header, key)
@@ -144,6 +137,26 @@ def encode_header(header: Header) -> bytes:
         }
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     return text.encode("utf-8")
+
+
+def _sensor_std(path: Path, value: Any) -> tuple[float, ...]:
+    sensor_std = _numbers(
+        path, "sensor_std", value, 6, "[x, z, phi, F_x, F_z, tau]", ESTIMATE_NOISE
+    )
+    for name, std in zip(SENSOR_NAMES, sensor_std, strict=True):
+        if std < 0:
+            raise EpisodeError(
+                path, f"sensor_std of {name} is {std:g}, expected >= 0", ESTIMATE_NOISE
+            )
+        largest, unit, likely = LARGEST_NOISE.get(name, (math.inf, "", ""))
+        if std > largest:
+            raise EpisodeError(
+                path,
+                f"sensor_std of {name} is {std:g}, expected {unit} (at most {largest:g}); it"
+                f" looks like {likely}",
+                f"give it in {unit}",
+            )
+    return tuple(sensor_std)
 
 
 def _priors(path: Path, content: Any) -> dict[str, tuple[float, float]]:

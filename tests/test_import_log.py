@@ -1,0 +1,213 @@
+"""Importing recordings: whatever frame, sign and sensor they come with, the episode is the same."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_logs import (
+    HOLD,
+    RAMP,
+    RATE,
+    SAMPLE_STD,
+    STIFFNESS,
+    Setting,
+    an_episode,
+    choices_of,
+    log_of,
+    sampled,
+)
+from scipy.spatial.transform import Rotation
+
+from tpcd.data.episode import Episode, read_episode, write_together
+from tpcd.data.measured import Measured, NoCommandsError, read_measured
+from tpcd.errors import EpisodeError
+from tpcd.logs.importing import Importing, import_log
+from tpcd.logs.log import LogError
+from tpcd.logs.plane import Plane, WrenchReading, project
+from tpcd.logs.settled import Stillness, find_holds, find_settled
+
+WINDOW_SAMPLES = 51
+ROW_STD = np.array(SAMPLE_STD) / math.sqrt(WINDOW_SAMPLES)
+EPISODE = an_episode()
+SAMPLES = sampled(EPISODE)
+angles = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
+lengths = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
+TURNED = Setting(
+    base=Rotation.from_euler("xyz", [0.3, 0.5, 2.0]),
+    tool=Rotation.from_euler("xyz", [3.0, 0.2, 0.1]),
+    origin=(0.4, -0.2, 0.1),
+    point=(0.01, 0.02, -0.05),
+    in_tool=True,
+    sign=-1.0,
+)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    base=angles,
+    tool=angles,
+    origin=lengths,
+    point=lengths,
+    in_tool=st.booleans(),
+    sign=st.sampled_from([-1.0, 1.0]),
+)
+def test_the_episode_is_the_same_in_every_frame(base, tool, origin, point, in_tool, sign) -> None:
+    turns = (Rotation.from_euler("xyz", list(a)) for a in (base, tool))
+    setting = Setting(*turns, origin, point, in_tool, sign)
+    found = import_log(log_of(setting, SAMPLES), choices_of(setting))
+    content = found.content
+    assert isinstance(content, Episode) and len(content) == len(EPISODE)
+    # Five standard errors of a mean, and what is left of the approach.
+    assert (np.abs((content.poses - EPISODE.poses).numpy()).max(0) < 5 * ROW_STD[:3] + 1e-7).all()
+    wrong = np.abs((content.wrenches - EPISODE.wrenches).numpy()).max(0)
+    assert (wrong < 5 * ROW_STD[3:] + 1e-4).all()
+    assert float((content.commands - EPISODE.commands)[1:].abs().max()) < 1e-9
+    assert found.account.doubts == ()
+    assert np.allclose(found.planar.motion_left_out, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frame", "sign", "expected"),
+    [
+        ("tool", 1.0, "inverted (see --invert_wrench): then 1% would be left"),
+        ("world", -1.0, "given in tool axes (see --wrench_frame): then"),
+        ("world", 1.0, "inverted (see --invert_wrench) and given in tool axes"),
+    ],
+)
+def test_a_wrench_that_is_read_wrongly_is_noticed_and_how(frame, sign, expected) -> None:
+    reading = WrenchReading(frame, sign, TURNED.point)
+    choices = choices_of(TURNED, wrench=reading)
+    doubts = import_log(log_of(TURNED, SAMPLES), choices).account.doubts
+    assert any(expected in doubt for doubt in doubts)
+
+
+def test_wrong_stiffness_is_no_matter_of_signs() -> None:
+    choices = replace(choices_of(TURNED), stiffness=(1000.0, 1000.0, 50.0))
+    with pytest.raises(LogError, match="check --stiffness"):
+        # A start 0.1 mm off its command would be pressed, if K were 10 kN/m.
+        import_log(log_of(TURNED, SAMPLES), replace(choices, stiffness=(1e5, 1e5, 50.0)))
+    doubts = import_log(log_of(TURNED, SAMPLES), choices).account.doubts
+    assert any("no sign or frame of the wrench fits" in doubt for doubt in doubts)
+
+
+def test_the_zero_of_the_sensor_is_taken_where_it_is_asked_for() -> None:
+    setting = replace(TURNED, zero=(3.0, -2.0, 5.0, 0.2, -0.1, 0.3))
+    log = log_of(setting, SAMPLES)
+    biased = import_log(log, choices_of(setting))
+    with pytest.raises(EpisodeError, match="zero the sensor"):
+        biased.files(Path("e"))
+    content = import_log(log, choices_of(setting, tare=True)).content
+    assert isinstance(content, Episode)
+    # Tool axes turn by little, so a zero that is constant in them is all but constant.
+    assert float((content.wrenches - EPISODE.wrenches).abs().max()) < 0.2
+
+
+def test_a_recording_must_start_free() -> None:
+    pressed = int(np.argmax(EPISODE.wrenches[:, 1].numpy() > 2.0))
+    log = log_of(Setting(), SAMPLES).during(pressed * (HOLD + RAMP) + RAMP, None)
+    with pytest.raises(LogError, match="is pressed by K"):
+        import_log(log, choices_of(Setting()))
+
+
+def test_holds_that_end_while_the_arm_moves_are_left_out_and_told() -> None:
+    slow = sampled(EPISODE, time_constant=0.4)
+    found = import_log(log_of(Setting(), slow), choices_of(Setting()))
+    assert found.settled.unsettled and len(found.settled.rows) < len(EPISODE)
+    assert any("holds left out, for the arm still moved" in f for f in found.account.findings)
+    patient = choices_of(Setting(), stillness=Stillness(drift=(1.0, 1.0, 100.0, 10.0)))
+    assert len(import_log(log_of(Setting(), slow), patient).settled.rows) == len(EPISODE)
+    strict = choices_of(Setting(), stillness=Stillness(window=1.7))
+    with pytest.raises(LogError, match=r"no command is held for 1.7 s|shorter than 1.7 s"):
+        import_log(log_of(Setting(), slow), strict)
+
+
+def test_noise_of_rows_counts_what_is_correlated() -> None:
+    # 31 stretches of 3 degrees of freedom: a standard deviation is good to 7 %; four times that.
+    found = find_settled(project(log_of(Setting(), SAMPLES), Plane(), WrenchReading()), Stillness())
+    assert np.allclose(found.noise / ROW_STD, 1.0, atol=0.3)
+    random, correlated = np.random.default_rng(2), dict(SAMPLES)
+    white = 0.2 * random.standard_normal(len(SAMPLES["time"]) + 4)
+    correlated["wrench"] = SAMPLES["wrench"] + np.convolve(white, np.ones(5), "valid")[:, None]
+    again = find_settled(
+        project(log_of(Setting(), correlated), Plane(), WrenchReading()), Stillness()
+    )
+    # A sum of five: 5 times the noise of a mean, beside that of every sample.
+    expected = np.hypot(ROW_STD[3:5], 5 * 0.2 / math.sqrt(WINDOW_SAMPLES))
+    assert np.allclose(again.noise[3:5] / expected, 1.0, atol=0.4)
+
+
+def test_readings_finer_than_they_are_printed_have_the_noise_of_rounding() -> None:
+    coarse = {**SAMPLES, "pose": np.round(SAMPLES["pose"], 2)}
+    found = find_settled(project(log_of(Setting(), coarse), Plane(), WrenchReading()), Stillness())
+    assert found.noise[0] >= 0.01 / math.sqrt(12.0) - 1e-9
+
+
+def test_motion_and_force_out_of_the_plane_are_said() -> None:
+    log = log_of(Setting(), SAMPLES)
+    wave = np.sin(log.times)
+    log = replace(
+        log,
+        positions=log.positions + np.outer(0.03 * wave, [0.0, 1.0, 0.0]),
+        rotations=Rotation.from_rotvec(np.outer(0.2 * np.abs(wave), [1.0, 0.0, 0.0]))
+        * log.rotations,
+        forces=log.forces + np.outer(5.0 * wave, [0.0, 1.0, 0.0]),
+    )
+    found = import_log(log, choices_of(Setting()))
+    (line,) = (f for f in found.account.findings if "leaves out" in f)
+    assert "60 mm of motion" in line and "11 degrees" in line and "5 N of force" in line
+    assert sum("out of the plane: check" in doubt for doubt in found.account.doubts) == 2
+
+
+def test_without_set_points_rows_are_kept_but_are_no_episode(tmp_path: Path) -> None:
+    log = replace(log_of(Setting(), SAMPLES), command_positions=None, command_rotations=None)
+    found = import_log(log, choices_of(Setting()))
+    assert isinstance(found.content, Measured)
+    assert "no set points" in found.account.doubts[0]
+    write_together(dict(found.files(tmp_path / "run")))
+    with pytest.raises(NoCommandsError, match="commands: unknown"):
+        read_episode(tmp_path / "run.csv")
+    back = read_measured(tmp_path / "run.csv")
+    assert np.array_equal(back.poses, found.content.poses)
+    assert np.array_equal(back.wrenches, found.content.wrenches)
+
+
+def test_a_ramp_is_no_hold() -> None:
+    commands = np.zeros((300, 3))
+    commands[100:200, 0] = np.linspace(0.0, 0.05, 100)
+    commands[200:, 0] = 0.05
+    long = [tuple(hold) for hold in find_holds(commands).tolist() if hold[1] - hold[0] > 10]
+    assert long == [(0, 101), (199, 300)]
+
+
+def test_the_angle_is_the_turn_about_the_normal() -> None:
+    log = log_of(Setting(), SAMPLES)
+    swing = Rotation.from_rotvec([0.3, 0.0, 0.0])
+    tilted = replace(log, rotations=log.rotations * swing)
+    planar = project(tilted, Plane(), WrenchReading())
+    expected = SAMPLES["pose"][:, 2] - SAMPLES["pose"][0, 2]
+    assert np.allclose(planar.poses[:, 2], expected, atol=1e-9)
+
+
+def test_choices_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected right angles"):
+        Plane(x=(1.0, 0.0, 0.0), z=(1.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="three positive numbers"):
+        Importing((0.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match="six numbers from 0 up"):
+        Importing(STIFFNESS, sensor_std=(-1.0,) * 6)
+    log = log_of(Setting(), SAMPLES)
+    with pytest.raises(LogError, match="points out of the plane"):
+        project(log, Plane(tool_x=(0.0, 1.0, 0.0)), WrenchReading())
+    lacking = replace(log, missing=frozenset({"y", "F_y"}))
+    with pytest.raises(LogError, match="y, F_y not recorded"):
+        project(lacking, Plane(x=(0.0, 1.0, 0.0)), WrenchReading())
+    project(lacking, Plane(), WrenchReading())
+    with pytest.raises(LogError, match="of .* samples can be used"):
+        log.during(1e6, None)
+    assert RATE * (HOLD + RAMP) * len(EPISODE) == len(log)

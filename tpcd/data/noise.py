@@ -1,0 +1,265 @@
+"""Noise of the sensors as the data themselves show it, without any model of contact.
+
+Three things need no theta: a command that is given twice in a row leaves the arm where it is, so
+both rows differ by noise alone; in free space the arm comes to where it is sent; and in equilibrium
+w = K (x - u), whatever is touched. What departs from the last smoothly, as gains, biases, drifts,
+lags and turned sensors do, is fitted away first.
+
+No effect makes readings scatter less than their noise, so noise that is stated far too large is
+certain; noise that looks too small may be an effect that shows in pauses, such as a lag.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tpcd.data.episode import Episode, locate, read_rows
+from tpcd.data.header import SENSOR_NAMES, Header, read_header
+from tpcd.errors import EpisodeError
+
+FEWEST_PAUSES = 3
+"""Repeats below which their scatter says nothing."""
+NEEDED_MOTION = (
+    "repeat commands in free space and in contact, at least 4 times in all (as the motions of"
+    " scripts/plan_diagnosis.py do), or hold the arm still without contact for about 10 s and give"
+    " sensor_std: the standard deviation of x, z [m], phi [rad], F_x, F_z [N], tau [N·m]"
+)
+CLIP = 4.0
+"""Rows this many standard deviations from where they were sent are not free."""
+CURVES = 7
+"""Terms that are fitted away from w - K (x - u)."""
+POSES_SHARE = 0.2
+"""Noise of a force is read from w - K (x - u) where that of the pose is at most this part of it."""
+SURE, LIKELY = 1e-6, 1e-4
+"""Probabilities below which stated noise is refused, or warned of."""
+TOO_LARGE, TOO_SMALL = 1 / 3, 3.0
+"""Scatter over stated noise beyond which it is plainly wrong."""
+NEAR, NEAR_SHARE = 0.2, 0.1586
+"""A normal number is within 0.2 sd of anywhere with at most this probability."""
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """One standard deviation of x, z, phi, F_x, F_z, tau, and what it rests on."""
+
+    std: tuple[float, ...]
+    freedom: tuple[int, ...]
+    """Degrees of freedom; the relative error of `std` is about 1 / sqrt(2 freedom)."""
+
+    def sentence(self) -> str:
+        """The estimate in words, ready for a YAML."""
+        values = ", ".join(f"{value:.2g}" for value in self.std)
+        error = 1 / math.sqrt(2 * min(self.freedom))
+        return (
+            f"sensor_std estimated as [{values}] from repeated commands, free rows and"
+            f" w - K (x - u); good to about {error:.0%}"
+        )
+
+
+def resolution(values: Float[np.ndarray, " n"]) -> float:
+    """The smallest step between readings; 0 where all are equal."""
+    steps = np.diff(np.unique(values))
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def estimate_noise(episodes: Sequence[Episode]) -> NoiseEstimate | None:
+    """Noise of the sensors from episodes of one set-up; None where too few commands repeat.
+
+    What the episodes say of their noise is not used.
+    """
+    squares, freedom = _pauses(episodes)
+    if freedom < FEWEST_PAUSES:
+        return None
+    readings = np.concatenate([_readings(episode) for episode in episodes])
+    least = np.array([resolution(column) for column in readings.T]) / math.sqrt(12.0)
+    std = np.maximum(np.sqrt(squares / freedom), least)
+    counts = np.full(6, freedom)
+    away = np.concatenate([_away(episode)[1:] for episode in episodes])
+    free = (np.abs(away) <= CLIP * std[:3]).all(1)
+    if free.sum() > 1:
+        wrenches = np.concatenate([episode.wrenches.numpy()[1:] for episode in episodes])[free]
+        squares = squares + np.append(
+            (away[free] ** 2).sum(0), ((wrenches - wrenches.mean(0)) ** 2).sum(0)
+        )
+        counts += np.array([free.sum()] * 3 + [free.sum() - 1] * 3)
+        std = np.maximum(np.sqrt(squares / counts), least)
+    variance, rest = _parity(episodes)
+    of_poses = (episodes[0].stiffness.numpy() * std[:3]) ** 2
+    for axis in np.flatnonzero(of_poses < POSES_SHARE * variance):
+        # All rows speak, and little of it has to be taken away.
+        std[3 + axis] = max(math.sqrt(variance[axis] - of_poses[axis]), least[3 + axis])
+        counts[3 + axis] = rest
+    return NoiseEstimate(tuple(std.tolist()), tuple(counts.tolist()))
+
+
+def read_noisy(paths: Sequence[Path]) -> tuple[list[Episode], list[str]]:
+    """Episodes of one set-up where the YAML may not say the noise, and what was done about it.
+
+    Where none of them says it, it is estimated from all of them together; where some do, the
+    others take theirs. Raises `EpisodeError` as `read_episode` does, and where the noise is not
+    given and the data do not show it, with the motion that would.
+    """
+    places = [locate(Path(path)) for path in paths]
+    headers = [read_header(header) for _, header in places]
+    silent = [k for k, header in enumerate(headers) if header.sensor_std is None]
+    if not silent:
+        return [read_rows(t, h) for (t, _), h in zip(places, headers, strict=True)], []
+    known = [k for k in range(len(headers)) if k not in silent]
+    if known:
+        std, note = headers[known[0]].sensor_std, f"sensor_std taken from {places[known[0]][1]}"
+    else:
+        rough = [read_rows(t, _quiet(h)) for (t, _), h in zip(places, headers, strict=True)]
+        found = estimate_noise(rough)
+        if found is None:
+            raise EpisodeError(
+                places[silent[0]][1],
+                "key sensor_std is missing and no command is repeated often enough to estimate it",
+                NEEDED_MOTION,
+            )
+        std, note = found.std, found.sentence()
+    headers = [replace(h, sensor_std=h.sensor_std or std) for h in headers]
+    names = ", ".join(str(places[k][1]) for k in silent)
+    episodes = [read_rows(t, h) for (t, _), h in zip(places, headers, strict=True)]
+    for episode in () if known else episodes:
+        try:
+            check_noise(episode)
+        except EpisodeError as error:
+            raise EpisodeError(
+                places[silent[0]][1],
+                "key sensor_std is missing, and rows of one command differ by more than noise",
+                "the arm creeps or lags in pauses, so record it at rest for about 10 s and give"
+                " the standard deviations",
+            ) from error
+    return episodes, [f"{names}: {note}"]
+
+
+def check_noise(episode: Episode) -> list[str]:
+    """Sentences on stated noise that the data speak against; often none.
+
+    Raises `EpisodeError` where it is plainly too large, and where forces scatter many times more
+    than is stated in a way that no effect of arm or sensor does.
+    """
+    from scipy.stats import binom, chi2
+
+    path = episode.path or Path("the episode")
+    stated, readings = episode.sensor_std.numpy(), _readings(episode)
+    targets = np.column_stack((episode.commands.numpy(), np.zeros((len(readings), 3))))
+    away = np.abs(_wrapped(readings - targets))[1:]
+    measured = [(name, k, *_ratio(episode, k)) for k, name in enumerate(SENSOR_NAMES)]
+    for name, k, ratio, freedom, _ in measured:
+        if stated[k] <= 0:
+            continue
+        near = int((away[:, k] < NEAR * stated[k]).sum())
+        by_share = binom.sf(near - 1, len(away), NEAR_SHARE) < SURE
+        by_scatter = ratio < TOO_LARGE and chi2.cdf(ratio**2 * freedom, freedom) < SURE
+        if by_share or by_scatter:
+            found = (
+                f"{near} of {len(away)} rows lie within a fifth of it of where they would be"
+                if by_share
+                else f"readings scatter by {ratio * stated[k]:.2g}"
+            )
+            raise EpisodeError(
+                path,
+                f"sensor_std of {name} is {stated[k]:g}, plainly too large: {found}",
+                "give one standard deviation in SI units, or leave sensor_std out to have it"
+                " estimated",
+            )
+    warnings = []
+    for name, k, ratio, freedom, source in measured:
+        p = chi2.sf(ratio**2 * freedom, freedom) if freedom else 1.0
+        if stated[k] <= 0 or ratio < TOO_SMALL or p > LIKELY:
+            continue
+        told = f"sensor_std of {name} is {stated[k]:g}, but {source} by {ratio * stated[k]:.2g}"
+        if source == _PARITY and ratio > 2 * TOO_SMALL and p < SURE:
+            raise EpisodeError(
+                path, f"{told}: plainly too small", "give what the sensor really scatters by"
+            )
+        warnings.append(f"{told}: it is too small, or the arm creeps or lags")
+    return warnings
+
+
+_PAUSES, _PARITY = "rows of one command differ", "w - K (x - u) scatters"
+
+
+def _ratio(episode: Episode, channel: int) -> tuple[float, int, str]:
+    """Scatter of a channel over what is stated, its degrees of freedom, and where it shows."""
+    stated = episode.sensor_std.numpy()
+    if channel >= 3:
+        variance, freedom = _parity([episode])
+        axis = channel - 3
+        expected = stated[channel] ** 2 + float(episode.stiffness[axis] * stated[axis]) ** 2
+        if freedom > CURVES and expected > 0:
+            return math.sqrt(variance[axis] / expected), freedom, _PARITY
+    squares, freedom = _pauses([episode])
+    if not freedom or stated[channel] <= 0:
+        return 1.0, 0, _PAUSES
+    return math.sqrt(squares[channel] / freedom) / stated[channel], freedom, _PAUSES
+
+
+def _pauses(episodes: Sequence[Episode]) -> tuple[Float[np.ndarray, " 6"], int]:
+    """Squares of what rows of one command, given again and again, depart from their mean by."""
+    squares, freedom = np.zeros(6), 0
+    for episode in episodes:
+        commands, readings = episode.commands.numpy(), _readings(episode)
+        changes = np.abs(_wrapped(np.diff(commands, axis=0))).max(1) > 1e-9
+        groups = np.split(np.arange(len(readings)), np.flatnonzero(changes) + 1)
+        for rows in groups:
+            # The start row's command is the measured pose.
+            rows = rows[rows > 0]
+            if len(rows) > 1:
+                part = readings[rows]
+                part = part[0] + _wrapped(part - part[0])
+                squares += ((part - part.mean(0)) ** 2).sum(0)
+                freedom += len(rows) - 1
+    return squares, freedom
+
+
+def _parity(episodes: Sequence[Episode]) -> tuple[Float[np.ndarray, " 3"], int]:
+    """Variance of w - K (x - u) about what smooth effects of arm and sensor leave there."""
+    squares, freedom = np.zeros(3), 0
+    for episode in episodes:
+        away, wrenches = _away(episode)[1:], episode.wrenches.numpy()[1:]
+        moved = _wrapped(np.diff(episode.commands.numpy(), axis=0))
+        if len(away) <= CURVES:
+            continue
+        residual = wrenches - episode.stiffness.numpy() * away
+        ones, time = np.ones(len(away)), np.linspace(-1.0, 1.0, len(away))
+        for axis in range(3):
+            step = moved[:, axis]
+            design = np.column_stack((ones, time, away, step, np.sign(step)))
+            scale = np.abs(design).max(0)
+            fitted = design / np.where(scale > 0, scale, 1.0)
+            left = (
+                residual[:, axis]
+                - fitted @ np.linalg.lstsq(fitted, residual[:, axis], rcond=None)[0]
+            )
+            squares[axis] += left @ left
+        freedom += len(away) - CURVES
+    return squares / max(freedom, 1), freedom
+
+
+def _readings(episode: Episode) -> Float[np.ndarray, "n 6"]:
+    return torch.cat((episode.poses, episode.wrenches), dim=-1).numpy()
+
+
+def _away(episode: Episode) -> Float[np.ndarray, "n 3"]:
+    return _wrapped((episode.poses - episode.commands).numpy())
+
+
+def _wrapped(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """The same with the angle, which is the third entry, within half a turn."""
+    values = values.copy()
+    values[:, 2] = np.remainder(values[:, 2] + math.pi, 2 * math.pi) - math.pi
+    return values
+
+
+def _quiet(header: Header) -> Header:
+    """The header with noise so large that no row can be refused for it."""
+    return replace(header, sensor_std=(1.0, 1.0, math.pi, 1e4, 1e4, 1e4))

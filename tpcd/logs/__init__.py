@@ -1,0 +1,1 @@
+"""Recordings made elsewhere: read, brought into the plane, cut into settled steps."""

@@ -1,0 +1,195 @@
+"""ROS 1 bags, ROS 2 bags and MCAP files, read through rosbags (extra `bags`).
+
+Poses and set points are geometry_msgs/PoseStamped, wrenches WrenchStamped. The samples are those of
+the pose; wrenches are interpolated to its times, a set point holds until the next one comes. Times
+are those of the headers, or of the recorder where the headers have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tpcd.logs.columns import in_order
+from tpcd.logs.log import Log, LogError
+
+POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
+KINDS = {"pose": POSE, "wrench": WRENCH, "command": POSE}
+SUFFIXES = (".bag", ".mcap", ".db3")
+COMMAND_WORDS = (
+    "command",
+    "cmd",
+    "target",
+    "desired",
+    "setpoint",
+    "set_point",
+    "reference",
+    "goal",
+    "equilibrium",
+)
+"""A topic whose name has one of these is taken for the set point."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Messages of one topic in order of time."""
+
+    name: str
+    frame: str
+    times: Float[np.ndarray, " k"]
+    """[s]"""
+    values: Float[np.ndarray, "k w"]
+    """Position and quaternion (x, y, z, w), or force and torque."""
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: a file of such a kind, or the folder of a ROS 2 bag."""
+    return path.suffix.lower() in SUFFIXES or path.is_dir()
+
+
+def read_bag(path: Path, topics: Sequence[str] = ()) -> Log:
+    """The recording in a bag; `topics` read pose=TOPIC, wrench=TOPIC, command=TOPIC.
+
+    Raises `LogError` for a bag that cannot be read and for topics that are missing or of another
+    type, `ValueError` for malformed `topics`.
+    """
+    if not path.exists():
+        raise LogError(path, "no such file", "give a bag, an MCAP file, or a table")
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise LogError(path, "is a folder without metadata.yaml", "give the folder of a ROS 2 bag")
+    named = _named(topics)
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise LogError(path, "bags need rosbags", "pip install 'tpcd[bags]'") from error
+    try:
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        with AnyReader([path], default_typestore=store) as reader:
+            types = {c.topic: c.msgtype for c in reader.connections}
+            chosen = choose_topics(types, named, path)
+            read = {role: _read(reader, topic, path) for role, topic in chosen.items()}
+    except (AnyReaderError, OSError, ValueError) as error:
+        if isinstance(error, LogError):
+            raise
+        problem = " ".join(str(error).split())
+        raise LogError(path, f"cannot be read as a bag ({problem})", "record it again") from error
+    return in_order(_joined(path, read))
+
+
+def choose_topics(types: dict[str, str], named: dict[str, str], path: Path) -> dict[str, str]:
+    """The topic of each role; one that is not named is found by type and name if only one fits."""
+    for role, topic in named.items():
+        found = types.get(topic)
+        if found != KINDS[role]:
+            there = f"is {found}" if found else "is not in the bag"
+            fitting = ", ".join(t for t, kind in types.items() if kind == KINDS[role]) or "none"
+            raise LogError(
+                path, f"topic {topic!r} {there}, expected {KINDS[role]}", f"there are: {fitting}"
+            )
+    chosen = dict(named)
+    for role in ("command", "wrench", "pose"):
+        if role in chosen:
+            continue
+        fitting = [t for t, k in types.items() if k == KINDS[role] and t not in chosen.values()]
+        commands = [t for t in fitting if any(word in t.lower() for word in COMMAND_WORDS)]
+        fitting = commands if role == "command" else fitting
+        if len(fitting) == 1:
+            chosen[role] = fitting[0]
+        elif fitting or role != "command":
+            found = ", ".join(fitting) or f"none of {KINDS[role]}"
+            raise LogError(
+                path, f"topics for the {role}: {found}", f"name one with --topics {role}=TOPIC"
+            )
+    return chosen
+
+
+def _named(topics: Sequence[str]) -> dict[str, str]:
+    named = {}
+    for entry in topics:
+        role, equals, topic = entry.partition("=")
+        if not equals or role not in KINDS or not topic:
+            raise ValueError(f"topics: found {entry!r}, expected pose=, wrench= or command=TOPIC")
+        named[role] = topic
+    return named
+
+
+def _read(reader: Any, name: str, path: Path) -> Topic:
+    connections = [c for c in reader.connections if c.topic == name]
+    times, values, frames = [], [], set()
+    for connection, recorded, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        stamp = message.header.stamp
+        time = stamp.sec + 1e-9 * stamp.nanosec
+        times.append(time if time else 1e-9 * recorded)
+        frames.add(message.header.frame_id)
+        if connection.msgtype == POSE:
+            p, q = message.pose.position, message.pose.orientation
+            values.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+        else:
+            f, t = message.wrench.force, message.wrench.torque
+            values.append((f.x, f.y, f.z, t.x, t.y, t.z))
+    if not values:
+        raise LogError(path, f"topic {name!r} has no messages", "name another with --topics")
+    if len(frames) > 1:
+        found = ", ".join(sorted(frames))
+        raise LogError(path, f"topic {name!r} changes its frame ({found})", "split the recording")
+    order = np.argsort(times, kind="stable")
+    return Topic(name, frames.pop(), np.array(times)[order], np.array(values, dtype=float)[order])
+
+
+def _joined(path: Path, read: dict[str, Topic]) -> Log:
+    """All topics at the times of the pose, where all of them have begun and none has ended."""
+    pose, wrench, command = read["pose"], read["wrench"], read.get("command")
+    begin = max(topic.times[0] for topic in read.values())
+    end = min(pose.times[-1], wrench.times[-1])
+    during = (pose.times >= begin) & (pose.times <= end)
+    if during.sum() < 2:
+        spans = "; ".join(
+            f"{t.name} {t.times[0]:.2f} to {t.times[-1]:.2f} s" for t in read.values()
+        )
+        raise LogError(path, f"the topics do not overlap in time ({spans})", "check the clocks")
+    times, poses = pose.times[during], pose.values[during]
+    forces = np.stack(
+        [np.interp(times, wrench.times, column) for column in wrench.values.T], axis=1
+    )
+    notes = [f"pose is {pose.name} in {pose.frame!r}, wrench is {wrench.name} in {wrench.frame!r}"]
+    if wrench.frame != pose.frame:
+        notes.append(
+            "the frames differ: if the wrench is in axes of the tool, give --wrench_frame tool"
+        )
+    if command is None:
+        return Log(path, times, poses[:, :3], _rotations(poses, pose, path), forces[:, :3],
+                   forces[:, 3:], notes=tuple(notes))  # fmt: skip
+    notes.append(f"set point is {command.name} in {command.frame!r}")
+    if command.frame != pose.frame:
+        raise LogError(
+            path,
+            f"the pose is in {pose.frame!r}, the set point in {command.frame!r}",
+            "record both in one frame",
+        )
+    targets = command.values[np.searchsorted(command.times, times, side="right") - 1]
+    return Log(
+        path,
+        times,
+        poses[:, :3],
+        _rotations(poses, pose, path),
+        forces[:, :3],
+        forces[:, 3:],
+        targets[:, :3],
+        _rotations(targets, command, path),
+        notes=tuple(notes),
+    )
+
+
+def _rotations(poses: Float[np.ndarray, "k 7"], topic: Topic, path: Path) -> Rotation:
+    try:
+        return Rotation.from_quat(poses[:, 3:])
+    except ValueError as error:
+        raise LogError(path, f"topic {topic.name!r}: {error}", "record unit quaternions") from error

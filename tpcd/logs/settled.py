@@ -1,0 +1,136 @@
+"""Settled steps of a planar recording: where a command was held and the arm stood still.
+
+A row is the mean over the last moments of a hold. Each such stretch is cut into four blocks; the
+scatter of their means, halved, is the noise of the row (batch means: Law and Kelton, "Simulation
+Modeling and Analysis", on the variance of a correlated series' mean), so noise that is correlated
+for less than a block counts in full. What changes from one stretch to another, such as drift of the
+sensor, does not show in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from tpcd.data.noise import resolution
+from tpcd.logs.plane import PlanarLog
+
+BLOCKS = 4
+HELD = (1e-5, 1e-5, 1e-5)
+"""A command that stays so close to where its hold began is held [m, m, rad]."""
+SCATTER = 3.0
+"""Drift beyond what is allowed counts from so many standard errors of it."""
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """When an arm counts as settled."""
+
+    window: float = 0.5
+    """Length of the stretch at the end of a hold that makes a row [s]."""
+    drift: tuple[float, float, float, float] = (3e-4, 1e-3, 0.5, 0.05)
+    """Largest change across it of x and z [m], phi [rad], F_x and F_z [N], tau [N·m]."""
+
+    @property
+    def channels(self) -> Float[np.ndarray, " 6"]:
+        """The allowed drift of x, z, phi, F_x, F_z, tau."""
+        length, angle, force, torque = self.drift
+        return np.array([length, length, angle, force, force, torque])
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """k settled rows of a recording."""
+
+    stretches: Int[np.ndarray, "k 2"]
+    """First sample of each row's stretch, and the one after its last."""
+    rows: Float[np.ndarray, "k 6"]
+    """Mean x, z, phi [m, m, rad], F_x, F_z, tau [N, N, N·m]."""
+    commands: Float[np.ndarray, "k 3"] | None
+    """Held commands [m, m, rad]; None where they were not recorded."""
+    noise: Float[np.ndarray, " 6"]
+    """One standard deviation of a row."""
+    unsettled: tuple[float, ...]
+    """Times at which holds ended that were left out because the arm still moved [s]."""
+    brief: int
+    """Holds too short for a row."""
+
+
+def find_settled(log: PlanarLog, stillness: Stillness) -> Settled:
+    """The settled rows of a recording; none where no command was held long enough.
+
+    Without commands, steps cannot be told apart: then the rows are the whole recording, cut into
+    stretches of the window's length.
+    """
+    if log.commands is None:
+        stretches = _windows(log.times, stillness.window)
+        return _rows(log, stretches, None, (), 0)
+    holds = find_holds(log.commands)
+    ends = log.times[holds[:, 1] - 1]
+    long = ends - log.times[holds[:, 0]] >= stillness.window
+    brief = int(((ends - log.times[holds[:, 0]] >= stillness.window / 5) & ~long).sum())
+    stretches, unsettled = [], []
+    for (_, end), time in zip(holds[long], ends[long], strict=True):
+        first = int(np.searchsorted(log.times, time - stillness.window))
+        if end - first < 2 * BLOCKS:
+            brief += 1
+        elif _still(log, first, int(end), stillness):
+            stretches.append((first, int(end)))
+        else:
+            unsettled.append(float(time))
+    found = np.array(stretches, dtype=np.int64).reshape(-1, 2)
+    return _rows(log, found, log.commands, tuple(unsettled), brief)
+
+
+def find_holds(commands: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "h 2"]:
+    """First sample of every hold, and the one after its last; a ramp is many short ones."""
+    holds, begun = [], 0
+    rows = commands.tolist()
+    for k, row in enumerate(rows):
+        start = rows[begun]
+        if any(abs(a - b) > held for a, b, held in zip(row, start, HELD, strict=True)):
+            holds.append((begun, k))
+            begun = k
+    holds.append((begun, len(rows)))
+    return np.array(holds, dtype=np.int64)
+
+
+def _windows(times: Float[np.ndarray, " n"], window: float) -> Int[np.ndarray, "k 2"]:
+    edges = np.searchsorted(times, np.arange(times[0], times[-1], window))
+    pairs = np.stack((edges, np.append(edges[1:], len(times))), axis=1)
+    return pairs[pairs[:, 1] - pairs[:, 0] >= 2 * BLOCKS].astype(np.int64)
+
+
+def _still(log: PlanarLog, first: int, end: int, stillness: Stillness) -> bool:
+    values = np.column_stack((log.poses[first:end], log.wrenches[first:end]))
+    half = len(values) // 2
+    early, late = values[:half], values[half:]
+    error = np.hypot(early.std(0) / np.sqrt(len(early)), late.std(0) / np.sqrt(len(late)))
+    # The means of the halves are half of the stretch apart.
+    drift = 2.0 * np.abs(late.mean(0) - early.mean(0))
+    return bool((drift <= stillness.channels + 2.0 * SCATTER * error).all())
+
+
+def _rows(
+    log: PlanarLog,
+    stretches: Int[np.ndarray, "k 2"],
+    commands: Float[np.ndarray, "n 3"] | None,
+    unsettled: tuple[float, ...],
+    brief: int,
+) -> Settled:
+    values = np.column_stack((log.poses, log.wrenches))
+    rows, squares = np.empty((len(stretches), 6)), np.zeros((len(stretches), 6))
+    for k, (first, end) in enumerate(stretches):
+        part = values[first:end]
+        rows[k] = part.mean(0)
+        means = np.stack([block.mean(0) for block in np.array_split(part, BLOCKS)])
+        squares[k] = means.var(0, ddof=1) / BLOCKS
+    held = None
+    if commands is not None:
+        held = np.stack([commands[end - 1] for _, end in stretches]) if len(stretches) else rows
+        held = held[:, :3]
+    least = np.array([resolution(column) for column in values.T]) / np.sqrt(12.0)
+    noise = np.maximum(np.sqrt(squares.mean(0)), least) if len(rows) else np.full(6, np.nan)
+    return Settled(stretches, rows, held, noise, unsettled, brief)

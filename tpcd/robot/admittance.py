@@ -10,8 +10,9 @@ wrenches in the task's world frame.
 The arm follows after a servo delay T, so that in contact with a surface of stiffness k the loop is
 the integrator (k / D) exp(-s T): stable for k T / D < pi / 2, without overshoot for k T / D < 1 / e
 (K. J. Åström and R. M. Murray, Feedback Systems, chapter 10, phase margin of an integrator with
-delay). Damping of 0.04 s times the surface stiffness keeps the delays of servo, filter and
-sampling (about 50 ms) inside the first bound. In the air nothing is stiff and the same damping
+delay). Damping of 0.04 s times the stiffness keeps the delays of servo, filter and sampling (about
+45 ms) inside the first bound. In a corner the yield of one surface and the grip of the other add
+up, so twice the stiffness of a surface counts. In the air nothing is stiff and the same damping
 would only cost time: there the arm moves with a lighter one, slow enough that the first touch,
 which takes one delay to be felt, stays within a stated force.
 """
@@ -25,6 +26,8 @@ from jaxtyping import Float
 
 DAMPING_TIME = 0.04
 """Damping over surface stiffness [s]."""
+SURFACES = 2
+"""Surfaces that may be met at once."""
 REACTION_TIME = 0.05
 """From touching to the arm being slowed down: servo, filter and sampling [s]."""
 LEVER = 0.2
@@ -74,7 +77,7 @@ def settings_for_surface(
     """
     if not surface_stiffness > 0:
         raise ValueError(f"surface_stiffness is {surface_stiffness}, expected N/m above 0")
-    linear = damping_time * surface_stiffness
+    linear = damping_time * SURFACES * surface_stiffness
     damping = np.array([linear, linear, linear * LEVER**2])
     free = np.minimum(damping, free_time * np.array(stiffness))
     speed = min(largest_speed, impact_force / (surface_stiffness * REACTION_TIME))

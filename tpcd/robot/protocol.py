@@ -21,6 +21,10 @@ class Reading:
     """(F_x, F_z, tau) that the world exerts on the object [N, N, N·m]."""
     settled: bool = True
     """Whether the arm stood still in time."""
+    sensor_std: Float[Tensor, " 6"] | None = None
+    """Standard deviation of the noise of pose and wrench, where the arm tells."""
+    stamps: tuple[float, float] | None = None
+    """First and last moment of what was averaged, in the arm's own time [s]."""
 
 
 @runtime_checkable

@@ -25,9 +25,9 @@ class SettlingSettings:
     wrench_change: tuple[float, float, float] = (0.08, 0.08, 0.004)
     """The same of the wrench, on top of what its noise makes."""
     residual: tuple[float, float, float] = (0.03, 0.03, 0.005)
-    """Largest mean of K (u - r) + w over the window. Divided by K it is how far the arm may still be
-    from rest where it slides or hangs free, so no noise is added to it: with more noise it only
-    takes longer."""
+    """Largest mean of K (u - r) + w over the window. Divided by K it is how far the arm may still
+    be from rest where it slides or hangs free, so no noise is added to it: with more noise it
+    only takes longer."""
     noise_factor: float = 4.0
     """Standard deviations of a difference of means that noise may account for."""
     oscillation: float = 1.0
@@ -91,6 +91,13 @@ class Window:
         left = np.abs(rows[:, 7:10].mean(0))
         if (left > settings.residual).any():
             return None
+        return self.mean()
+
+    def mean(self) -> Still:
+        """The means, whether still or not; raises ValueError where nothing was read."""
+        if not self._rows:
+            raise ValueError("the window is empty, expected at least one reading")
+        rows = np.array(self._rows)
         mean = rows.mean(0)
         return Still(mean[1:4], mean[4:7], float(rows[0, 0]), float(rows[-1, 0]), len(rows))
 

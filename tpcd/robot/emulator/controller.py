@@ -28,7 +28,7 @@ CONTINUOUS = (SERVO_L, KICK)
 """Commands that are never answered with done."""
 POWER_ON, PROGRAM_RUNNING = 1, 2
 NORMAL_MODE, PROTECTIVE_STOPPED = 1, 4
-WRONG_MASS = 1.5
+WRONG_MASS = 0.8
 """What the controller does not know it carries under the fault wrong_payload [kg]."""
 DRIFT = 0.6
 """Of the force along the base's z under the fault drifting_sensor [N/s]."""

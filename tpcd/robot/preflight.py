@@ -1,0 +1,118 @@
+"""What must be so before an arm may explore: payload, wrench and noise in free air.
+
+Zeroing hides whatever the sensor carries at that moment, so the wrench is looked at before, after,
+and with the tool tilted: what was zeroed turns with the sensor and weight does not, so a payload
+that is off by m shows as a force of m g times the angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tpcd.errors import RobotError
+
+LARGEST_BEFORE_ZEROING = 10.0
+"""Force in free air that only a wrong payload or a contact explains [N]."""
+LARGEST_FREE = 2.0
+"""Force in free air after zeroing with which no exploration begins [N]."""
+LARGEST_DRIFT = 0.15
+"""Of a force in free air [N/s]."""
+TILT = 0.1
+"""Angle by which the tool is tilted both ways [rad]."""
+LARGEST_TILTED = 0.6
+"""Difference of the forces at both tilts [N]; 0.3 kg of wrong payload."""
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class FreeAir:
+    """Readings (n, 3) of an arm that stands still in free air."""
+
+    stamps: Float[np.ndarray, " n"]
+    poses: Float[np.ndarray, "n 3"]
+    wrenches: Float[np.ndarray, "n 3"]
+
+    @property
+    def force(self) -> float:
+        """Size of the mean force [N]."""
+        return float(np.linalg.norm(self.wrenches.mean(0)[:2]))
+
+
+def check_payload(stated: float | None, told: float) -> None:
+    """Raises RobotError where the controller was told another mass than stated [kg]."""
+    if stated is not None and abs(stated - told) > 0.05:
+        raise RobotError(
+            f"the controller was told a payload of {told:.2f} kg, expected {stated:.2f} kg as"
+            " stated; set it in the installation, with its centre of gravity"
+        )
+
+
+def check_before_zeroing(air: FreeAir) -> None:
+    """Raises RobotError for a wrench that is no offset of the sensor."""
+    if air.force > LARGEST_BEFORE_ZEROING:
+        raise RobotError(
+            f"a force of {air.force:.1f} N before zeroing, expected at most"
+            f" {LARGEST_BEFORE_ZEROING:g} N in free air; the arm touches something, or its payload"
+            " is wrong"
+        )
+
+
+def check_zeroed(air: FreeAir) -> None:
+    """Raises RobotError where a zeroed sensor does not read zero, or drifts."""
+    if air.force > LARGEST_FREE:
+        raise RobotError(
+            f"a force of {air.force:.1f} N in free air after zeroing, expected at most"
+            f" {LARGEST_FREE:g} N; the arm touches something, or the sensor drifts"
+        )
+    slope = np.polynomial.polynomial.polyfit(air.stamps - air.stamps[0], air.wrenches, 1)[1]
+    drift = float(np.abs(slope[:2]).max())
+    noise = 5.0 * _slope_noise(air)
+    if drift > LARGEST_DRIFT + noise:
+        raise RobotError(
+            f"the force drifts by {drift:.2f} N/s in free air, expected at most"
+            f" {LARGEST_DRIFT:g} N/s; let the sensor warm up, and look at its cable and mounting"
+        )
+
+
+def check_tilted(left: FreeAir, right: FreeAir) -> float:
+    """The force that turns with the tool, each way [N]; raises RobotError for a wrong payload."""
+    difference = float(np.linalg.norm((right.wrenches.mean(0) - left.wrenches.mean(0))[:2]))
+    if difference > LARGEST_TILTED:
+        mass = difference / (2 * TILT * GRAVITY)
+        raise RobotError(
+            f"the force changes by {difference:.2f} N when the tool tilts by ±{TILT:g} rad in free"
+            f" air, expected at most {LARGEST_TILTED:g} N; the payload is wrong by about"
+            f" {mass:.2f} kg"
+        )
+    return difference / 2
+
+
+def reading_noise(air: FreeAir) -> Float[np.ndarray, " 3"]:
+    """Standard deviation of one reading of the wrench [N, N, N·m]."""
+    return np.diff(air.wrenches, axis=0).std(0) / np.sqrt(2)
+
+
+def mean_noise(air: FreeAir, window: float) -> Float[np.ndarray, " 6"]:
+    """Standard deviation of the mean pose and wrench over so many seconds.
+
+    The larger of what independent readings would have and of what the means of the windows in
+    `air` have, which also holds slow noise and drift.
+    """
+    values = np.concatenate((air.poses, air.wrenches), axis=1)
+    duration = float(air.stamps[-1] - air.stamps[0])
+    count = max(1, round(len(values) * window / duration))
+    independent = values.std(0) / np.sqrt(count)
+    batches = len(values) // count
+    if batches < 3:
+        return independent
+    means = values[: batches * count].reshape(batches, count, 6).mean(1)
+    return np.maximum(independent, means.std(0, ddof=1))
+
+
+def _slope_noise(air: FreeAir) -> float:
+    """Standard deviation of a fitted slope of a force, if readings are independent [N/s]."""
+    spread = air.stamps.std() * np.sqrt(len(air.stamps))
+    return float((reading_noise(air)[:2] / spread).max())

@@ -1,0 +1,350 @@
+"""A Universal Robots arm that explores: admittance over its position servo, within limits.
+
+Every reading is checked (fresh stamp, safety system, force, workspace, whether the arm follows) and
+recorded. Whatever ends a move, the arm holds; where its link and safety system allow, it then
+retreats: first the way the world pushes it, then up. All readings of a move are on disk before
+the error reaches the caller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.data.episode import Episode
+from tpcd.errors import RobotError
+from tpcd.results import read_json, write_json
+from tpcd.robot import preflight
+from tpcd.robot.admittance import AdmittanceState, advance, at_rest, residual
+from tpcd.robot.arm_settings import ArmSettings
+from tpcd.robot.frames import TaskFrame, out_of_plane, planar_pose, planar_wrench, task_frame
+from tpcd.robot.frames import tcp_pose as tcp_of
+from tpcd.robot.link import Link, Sample
+from tpcd.robot.protocol import Reading
+from tpcd.robot.raw import RawRecord
+from tpcd.robot.settling import SettlingSettings, Window
+
+FRAME_FILE = "frame.json"
+MARGIN = (0.005, 0.005, 0.02)
+"""How far a pose may be outside of the workspace before the arm stops [m, m, rad]."""
+FOLLOWING = (0.015, 0.015, 0.1)
+"""How far the arm may be from its target: the delay's way at full speed, several times over."""
+RAMP_SPEED = 0.03
+"""Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
+RAMP_FORCE = 4.0
+"""Further force that ends a move in free air [N]."""
+LARGEST_STEP = 0.05
+"""Of the admittance after a pause of this process [s]."""
+
+
+class UniversalRobot:
+    """A UR arm under admittance control that holds an object; implements `Robot`."""
+
+    def __init__(
+        self, settings: ArmSettings, folder: Path, confirm: Callable[[str], bool] = lambda _: False
+    ) -> None:
+        """`folder` takes raw readings and the frame; `confirm` is shown what will happen, and the
+        arm stays where it is unless it answers True."""
+        self.settings, self._folder, self._confirm = settings, folder, confirm
+        self._law, self._settling = settings.admittance, SettlingSettings()
+        self._raw = RawRecord()
+        self._link: Link | None = None
+        self._frame: TaskFrame | None = None
+        self._state: AdmittanceState | None = None
+        self._noise = np.zeros(3)
+        self._over, self._row = 0, 0
+        self.at_rest: str | None = None
+        """How the arm was left after a stop; None while it may be moved."""
+
+    def start(self) -> Episode:
+        """Connect, ask, check payload and sensor in free air; the episode of the start pose.
+
+        Raises RobotError with one line for each check that fails.
+        """
+        tcp = self._connect()
+        frame = self.settings
+        self._frame = task_frame(tcp, frame.x_axis, frame.z_axis, frame.origin)
+        with self._watched("preflight"):
+            self._check_inside("the start pose", planar_pose(self._frame, tcp))
+            std = self._check_free_air()
+            air = self._stand(self._settling.window)
+        self._write_frame()
+        pose, wrench = _tensor(air.poses.mean(0)), _tensor(air.wrenches.mean(0))
+        return Episode(
+            commands=pose[None].clone(),
+            poses=pose[None],
+            wrenches=wrench[None],
+            stiffness=_tensor(np.array(self.settings.stiffness)),
+            sensor_std=std,
+            object=self.settings.object,
+            notes=self.settings.notes,
+            priors=dict(self.settings.priors),
+        )
+
+    def settle(self, command: Float[Tensor, " 3"]) -> Reading:
+        """Give way to the command until pose and force are steady, and average them.
+
+        Raises ValueError for a command outside of the workspace, RobotError where the arm had to
+        stop.
+        """
+        target = command.detach().double().numpy()
+        self._check_inside("a command", target)
+        self._row += 1
+        with self._watched(f"row_{self._row:03d}", command=target.tolist()):
+            return self._settle(target)
+
+    def resume(self, episode: Episode) -> None:
+        """Start, go to the earlier start pose and repeat the moves, since friction keeps the path.
+
+        Raises RobotError where a pose is not as it was: the object has slipped or the place moved.
+        """
+        path = self._folder / FRAME_FILE
+        if not path.is_file():
+            raise RobotError(
+                f"{path} is missing, so nobody knows the world of these rows; start anew"
+            )
+        tcp = self._connect()
+        self._frame = TaskFrame(**{key: np.array(v) for key, v in read_json(path).items()})
+        distance, lean = out_of_plane(self._frame, tcp)
+        if distance > 0.005 or lean > 0.03:
+            raise RobotError(
+                f"the tool is {1e3 * distance:.0f} mm and {lean:.2f} rad out of the plane of the"
+                " earlier rows; bring it back there in free air"
+            )
+        with self._watched("preflight_resumed"):
+            self._check_free_air()
+            self._ramp_to(episode.poses[0].numpy())
+            self._require_link().zero_sensor()
+            self._stand(self._settling.window)
+        length, angle = self.settings.resume_tolerance
+        for row in range(1, len(episode)):
+            reading = self.settle(episode.commands[row])
+            off = (reading.pose - episode.poses[row]).abs()
+            if float(off[:2].max()) > length or float(off[2]) > angle:
+                self.stop()
+                raise RobotError(
+                    f"repeating move {row} ends {1e3 * float(off[:2].max()):.1f} mm and"
+                    f" {1e3 * float(off[2]):.0f} mrad from where it did, expected at most"
+                    f" {1e3 * length:g} mm and {1e3 * angle:g} mrad; the object has slipped or the"
+                    " place has moved, so start a new exploration"
+                )
+
+    def stop(self) -> None:
+        """Hold at once, and retreat where that is safe; nothing if it has been done."""
+        if self._link is None or self.at_rest is not None:
+            return
+        self.at_rest = "the arm holds its place"
+        if self._frame is None or self._state is None or not self._link.alive:
+            return
+        try:
+            self._retreat()
+            self.at_rest = "the arm has retreated"
+        except RobotError as error:
+            self.at_rest = f"the arm holds its place, its way back not being free ({error})"
+        finally:
+            self._raw.write(self._folder, "retreat", {"row": self._row, "ended": self.at_rest})
+
+    def close(self) -> None:
+        """End servo and script, and disconnect."""
+        if self._link is None:
+            return
+        link, self._link = self._link, None
+        try:
+            link.stop()
+        finally:
+            link.disconnect()
+
+    def _connect(self) -> Float[np.ndarray, " 6"]:
+        """The TCP pose of an arm that may be moved."""
+        if self._link is None:
+            self._link = Link(self.settings.address, self.settings.rate)
+        sample = self._link.next_sample()
+        preflight.check_payload(self.settings.payload, self._link.payload())
+        if not self._confirm(self.settings.sentence()):
+            raise RobotError(
+                "workspace and limits were not confirmed, so the arm was not moved; answer yes, or"
+                " pass --yes where nobody can"
+            )
+        return sample.tcp
+
+    def _check_free_air(self) -> Float[Tensor, " 6"]:
+        """Check payload and sensor, measure the noise; standard deviations of a row."""
+        link, settings = self._require_link(), self.settings
+        first = self._stand(0.3)
+        preflight.check_before_zeroing(first)
+        start = first.poses.mean(0)
+        self._state = at_rest(start, np.zeros(3))
+        link.zero_sensor()
+        air = self._stand(settings.still_time)
+        preflight.check_zeroed(air)
+        self._noise = preflight.reading_noise(air)
+        above = start + np.array([0.0, settings.retreat, 0.0])
+        above[1] = min(above[1], settings.workspace_high[1])
+        self._ramp_to(above)
+        tilted = []
+        for angle in (-preflight.TILT, preflight.TILT):
+            self._ramp_to(above + np.array([0.0, 0.0, angle]))
+            tilted.append(self._stand(0.6))
+        turning = preflight.check_tilted(*tilted)
+        self._ramp_to(above)
+        self._ramp_to(start)
+        link.zero_sensor()
+        noise = preflight.mean_noise(air, self._settling.window)
+        # Beside noise, a row is off by what counts as still, by the force's own noise, which the
+        # spring turns into motion, and by the weight not made up for.
+        left = np.hypot(0.5 * np.array(self._settling.residual), noise[3:])
+        pose_std = np.hypot(noise[:3], left / np.array(settings.stiffness))
+        wrench_std = left
+        wrench_std[:2] = np.hypot(wrench_std[:2], 0.5 * turning)
+        return _tensor(np.concatenate((pose_std, wrench_std)))
+
+    def _settle(self, command: Float[np.ndarray, " 3"]) -> Reading:
+        link, frame = self._require_link(), self._frame
+        assert frame is not None and self._state is not None, "start first"
+        window, last, began = Window(self._settling, self._noise), None, None
+        count, still = 0, None
+        while still is None:
+            sample, pose, wrench = self._read()
+            began = sample.stamp if began is None else began
+            passed = 1 / link.rate if last is None else sample.stamp - last
+            last = sample.stamp
+            state = advance(self._law, self._state, command, wrench, min(passed, LARGEST_STEP))
+            self._state = state
+            link.servo(tcp_of(frame, state.reference))
+            window.add(sample.stamp, pose, wrench, residual(self._law, state, command))
+            count += 1
+            if count % 12:
+                continue
+            if window.unstable():
+                raise RobotError(
+                    "the force oscillates: the surface is stiffer than stated, or the arm slower;"
+                    f" state less than {self.settings.surface_mm_per_10n:g} mm per 10 N"
+                )
+            still = window.still()
+            if still is None and sample.stamp - began > self.settings.settle_time:
+                break
+        settled = still is not None
+        still = still or window.mean()
+        return Reading(
+            _tensor(still.pose), _tensor(still.wrench), settled, stamps=(still.start, still.end)
+        )
+
+    def _read(self) -> tuple[Sample, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """The next reading, checked and recorded."""
+        frame, state = self._frame, self._state
+        assert frame is not None
+        sample = self._require_link().next_sample()
+        pose, wrench = planar_pose(frame, sample.tcp), planar_wrench(frame, sample.wrench)
+        reference = pose if state is None else state.reference
+        self._raw.add(sample, pose, wrench, reference)
+        limit = self.settings.stop_force * np.array([1.0, 1.0, 0.2])
+        self._over = self._over + 1 if bool((np.abs(wrench) > limit).any()) else 0
+        if self._over > 1:
+            raise RobotError(
+                f"a wrench of ({wrench[0]:.1f}, {wrench[1]:.1f} N, {wrench[2]:.2f} N·m), beyond the"
+                f" limit of {self.settings.stop_force:g} N"
+            )
+        off = np.abs(pose - reference)
+        if bool((off > FOLLOWING).any()):
+            raise RobotError(
+                f"the arm is {1e3 * off[:2].max():.0f} mm and {1e3 * off[2]:.0f} mrad from its"
+                " target; it does not follow: look at speed slider, joint limits and collisions"
+            )
+        self._check_inside("the arm", pose, MARGIN)
+        return sample, pose, wrench
+
+    def _check_inside(
+        self, what: str, pose: Float[np.ndarray, " 3"], margin: tuple[float, ...] = (1e-9,) * 3
+    ) -> None:
+        low, high = (
+            np.array(v) for v in (self.settings.workspace_low, self.settings.workspace_high)
+        )
+        if bool((pose < low - margin).any() or (pose > high + margin).any()):
+            shown = ", ".join(f"{value:.3f}" for value in pose)
+            raise RobotError(
+                f"{what} is at ({shown}) [m, m, rad], outside of the workspace from"
+                f" {self.settings.workspace_low} to {self.settings.workspace_high}"
+            )
+
+    def _stand(self, seconds: float) -> preflight.FreeAir:
+        """Readings of an arm that is not moved."""
+        rows: list[np.ndarray] = []
+        frame, state = self._frame, self._state
+        while not rows or rows[-1][0] - rows[0][0] < seconds:
+            sample, pose, wrench = self._read()
+            if state is not None and frame is not None:
+                self._require_link().servo(tcp_of(frame, state.reference))
+            rows.append(np.concatenate(([sample.stamp], pose, wrench)))
+        table = np.array(rows)
+        return preflight.FreeAir(table[:, 0], table[:, 1:4], table[:, 4:7])
+
+    def _ramp_to(self, goal: Float[np.ndarray, " 3"], speed: float = RAMP_SPEED) -> None:
+        """Straight to a pose in free air; ends where a force comes up, with RobotError."""
+        link, frame = self._require_link(), self._frame
+        assert frame is not None
+        before: np.ndarray | None = None
+        waited = 0
+        while waited < 0.3 * link.rate:
+            _, pose, wrench = self._read()
+            state = self._state or at_rest(pose, np.zeros(3))
+            before = wrench if before is None else before
+            if float((np.abs(wrench) - np.abs(before))[:2].max()) > RAMP_FORCE:
+                raise RobotError(
+                    f"the arm met a force of {np.abs(wrench[:2]).max():.1f} N on its way through"
+                    " what should be free air"
+                )
+            way = goal - state.reference
+            steps = max(np.hypot(way[0], way[1]) / speed, abs(way[2]) / (10 * speed)) * link.rate
+            waited += steps < 1
+            reference = state.reference + way / max(1.0, float(steps))
+            self._state = AdmittanceState(reference, np.zeros(3), wrench)
+            link.servo(tcp_of(frame, reference))
+
+    def _retreat(self) -> None:
+        """Away along the force, then up; the arm holds where the way is not free."""
+        assert self._state is not None
+        force = self._state.wrench[:2]
+        size = float(np.linalg.norm(force))
+        settings, here = self.settings, self._state.reference
+        self._over = -(10**6)  # The limit was exceeded: now the force may only fall.
+        away = force / size if size > 1.0 else np.array([0.0, 1.0])
+        for way in (0.5 * away, np.array([0.0, 1.0])):
+            goal = here + np.append(settings.retreat * way, 0.0)
+            low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
+            self._ramp_to(np.clip(goal, np.minimum(low, here), np.maximum(high, here)))
+            here = self._state.reference
+
+    @contextmanager
+    def _watched(self, name: str, **about: object) -> Iterator[None]:
+        """Record a move however it ends, and bring the arm to rest if it ends badly."""
+        about = {"row": self._row, **about}
+        try:
+            yield
+        except BaseException as error:
+            ended = str(error) or type(error).__name__
+            self._raw.write(self._folder, name, {**about, "ended": ended})
+            self.stop()
+            if isinstance(error, RobotError):
+                raise RobotError(f"{error}; {self.at_rest}") from error
+            raise
+        self._raw.write(self._folder, name, {**about, "ended": "done"})
+
+    def _write_frame(self) -> None:
+        frame = self._frame
+        assert frame is not None
+        write_json(self._folder / FRAME_FILE, vars(frame))
+
+    def _require_link(self) -> Link:
+        if self._link is None:
+            raise RobotError("the arm is not connected; start it first")
+        return self._link
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.asarray(values, dtype=np.float64).copy())

@@ -17,9 +17,12 @@ _MOTION_STREAM = 3
 
 
 def make_policy(
-    name: PolicyName, limits: Limits, scene: Scene, seed: int, task: Task | None = None
+    name: PolicyName, limits: Limits, scene: Scene | None, seed: int, task: Task | None = None
 ) -> Policy:
-    """The policy of a name; only the expert looks at the scene, and there only at the wall."""
+    """The policy of a name; only the expert looks at the scene, and there only at the wall.
+
+    Raises ValueError for an expert without a scene.
+    """
     if name == "active":
         return ActivePolicy(limits, task=task)
     if name == "lookahead":
@@ -29,5 +32,7 @@ def make_policy(
     if name == "random":
         return MotionPolicy(lambda: press_and_slide(stream(seed, _MOTION_STREAM)), limits)
     if name == "expert":
+        if scene is None:
+            raise ValueError("the expert needs to see the wall, and there is no scene")
         return MotionPolicy(lambda: expert_motion(scene.wall_position), limits)
     return MotionPolicy(lambda: rich_exploration(stream(seed, _MOTION_STREAM)), limits)

@@ -33,8 +33,8 @@ def read_columns(path: Path) -> Columns:
         problem = " ".join(str(error).split())
         raise LogError(path, f"cannot be read as a table ({problem})", "export it again") from error
     columns: Columns = {}
-    for name in table.column_names:
-        for column, values in _flat(name, table.column(name)):
+    for name, content in zip(table.column_names, table.columns, strict=True):
+        for column, values in _flat(name, content):
             if column in columns:
                 raise LogError(path, f"column {column!r} appears twice", "rename one of them")
             columns[column] = values

@@ -1,0 +1,187 @@
+"""Bags of ROS 1 and 2 and MCAP files, written here through rosbags, come back as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_logs import Setting, an_episode, choices_of, in_space, sampled
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from tpcd.data.episode import Episode
+from tpcd.logs.bags import POSE, WRENCH, choose_topics, is_bag, read_bag
+from tpcd.logs.importing import import_log
+from tpcd.logs.log import LogError
+
+EPISODE = an_episode(4)
+SPACE = in_space(sampled(EPISODE), Setting())
+TOPICS = {"pose": "/tcp_pose", "wrench": "/ft_sensor", "command": "/target_pose"}
+FRAMES = {"pose": "base", "wrench": "base", "command": "base"}
+BEGIN = 1_700_000_000.0
+
+
+def messages(store: Any, frames: dict[str, str], stamped: bool) -> dict[str, list[tuple[int, Any]]]:
+    """Time [ns] and message of every topic; the wrench comes 3 ms later, commands at 20 Hz."""
+    types = store.types
+    ros1 = "seq" in types["std_msgs/msg/Header"].__dataclass_fields__
+
+    def header(time: float, role: str) -> Any:
+        whole = int(time) if stamped else 0
+        nanoseconds = round(1e9 * (time - int(time))) if stamped else 0
+        stamp = types["builtin_interfaces/msg/Time"](sec=whole, nanosec=nanoseconds)
+        more = {"seq": 0} if ros1 else {}
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frames[role], **more)
+
+    def pose(time: float, role: str, position: np.ndarray, rotation: np.ndarray) -> Any:
+        x, y, z, w = rotation.tolist()
+        return types[POSE](
+            header=header(time, role),
+            pose=types["geometry_msgs/msg/Pose"](
+                position=types["geometry_msgs/msg/Point"](*position.tolist()),
+                orientation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+            ),
+        )
+
+    def wrench(time: float, k: int) -> Any:
+        vector = types["geometry_msgs/msg/Vector3"]
+        return types[WRENCH](
+            header=header(time, "wrench"),
+            wrench=types["geometry_msgs/msg/Wrench"](
+                force=vector(*SPACE["force"][k].tolist()),
+                torque=vector(*SPACE["torque"][k].tolist()),
+            ),
+        )
+
+    written: dict[str, list[tuple[int, Any]]] = {role: [] for role in TOPICS}
+    for k, since in enumerate(SPACE["time"]):
+        time = BEGIN + since
+        nanoseconds = round(1e9 * time)
+        written["pose"].append(
+            (nanoseconds, pose(time, "pose", SPACE["position"][k], SPACE["rotation"][k]))
+        )
+        written["wrench"].append((nanoseconds + 3_000_000, wrench(time + 0.003, k)))
+        if k % 5 == 0:
+            written["command"].append(
+                (nanoseconds, pose(time, "command", SPACE["target"][k], SPACE["turned"][k]))
+            )
+    return written
+
+
+def write_ros1(path: Path, topics: dict[str, str], frames: dict[str, str], stamped: bool) -> Path:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    path = path.with_suffix(".bag")
+    with Writer1(path) as writer:
+        for role, written in messages(store, frames, stamped).items():
+            if role in topics:
+                kind = WRENCH if role == "wrench" else POSE
+                connection = writer.add_connection(topics[role], kind, typestore=store)
+                for time, message in written:
+                    writer.write(connection, time, bytes(store.serialize_ros1(message, kind)))
+    return path
+
+
+def write_ros2(plugin: StoragePlugin) -> Callable[..., Path]:
+    def write(path: Path, topics: dict[str, str], frames: dict[str, str], stamped: bool) -> Path:
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        with Writer2(path, version=9, storage_plugin=plugin) as writer:
+            for role, written in messages(store, frames, stamped).items():
+                if role in topics:
+                    kind = WRENCH if role == "wrench" else POSE
+                    connection = writer.add_connection(topics[role], kind, typestore=store)
+                    for time, message in written:
+                        writer.write(connection, time, bytes(store.serialize_cdr(message, kind)))
+        return path
+
+    return write
+
+
+WRITERS = {
+    "ros1": write_ros1,
+    "ros2": write_ros2(StoragePlugin.SQLITE3),
+    "mcap": write_ros2(StoragePlugin.MCAP),
+}
+
+
+def check(path: Path) -> None:
+    log = read_bag(path)
+    content = import_log(log, choices_of(Setting())).content
+    assert isinstance(content, Episode) and len(content) == len(EPISODE)
+    assert float((content.commands - EPISODE.commands)[1:].abs().max()) < 1e-6
+    assert float((content.poses - EPISODE.poses).abs().max()) < 1e-3
+    # Interpolated from readings 3 ms later.
+    assert float((content.wrenches - EPISODE.wrenches).abs().max()) < 0.2
+    k = 40
+    expected = SPACE["force"][k] + (SPACE["force"][k - 1] - SPACE["force"][k]) * 0.3
+    (found,) = log.forces[np.abs(log.times - (SPACE["time"][k] - SPACE["time"][1])) < 1e-4]
+    assert np.allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("stamped", [True, False], ids=["stamps", "recorder"])
+def test_bags_of_every_kind_are_the_episode(kind: str, stamped: bool, tmp_path: Path) -> None:
+    path = WRITERS[kind](tmp_path / "run", TOPICS, FRAMES, stamped)
+    assert is_bag(path)
+    check(path)
+
+
+@pytest.mark.parametrize(("kind", "pattern"), [("ros2", "*.db3"), ("mcap", "*.mcap")])
+def test_the_file_inside_a_bag_is_enough(kind: str, pattern: str, tmp_path: Path) -> None:
+    path = WRITERS[kind](tmp_path / "run", TOPICS, FRAMES, True)
+    (inside,) = path.glob(pattern)
+    check(inside)
+
+
+def test_frames_that_differ_are_told_or_refused(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "a", TOPICS, {**FRAMES, "wrench": "tool0"}, True)
+    assert any("give --wrench_frame tool" in note for note in read_bag(path).notes)
+    path = write_ros1(tmp_path / "b", TOPICS, {**FRAMES, "command": "world"}, True)
+    with pytest.raises(LogError, match="the pose is in 'base', the set point in 'world'"):
+        read_bag(path)
+
+
+def test_a_bag_without_set_points_says_so_later(tmp_path: Path) -> None:
+    topics = {role: topic for role, topic in TOPICS.items() if role != "command"}
+    log = read_bag(write_ros1(tmp_path / "a", topics, FRAMES, True))
+    assert log.command_positions is None
+
+
+def test_topics_are_chosen_where_only_one_fits() -> None:
+    path = Path("a.bag")
+    types = {"/pose": POSE, "/goal": POSE, "/ft": WRENCH, "/text": "std_msgs/msg/String"}
+    expected = {"pose": "/pose", "wrench": "/ft", "command": "/goal"}
+    assert choose_topics(types, {}, path) == expected
+    assert choose_topics({**types, "/b": POSE}, {"pose": "/pose"}, path) == expected
+    for more, named, match in (
+        ({"/b": POSE}, {}, r"topics for the pose: /pose, /b; name one with --topics pose=TOPIC"),
+        ({"/ft2": WRENCH}, {}, "topics for the wrench: /ft, /ft2"),
+        ({}, {"pose": "/nothing"}, "topic '/nothing' is not in the bag"),
+        ({}, {"pose": "/ft"}, "topic '/ft' is geometry_msgs/msg/WrenchStamped"),
+    ):
+        with pytest.raises(LogError, match=match):
+            choose_topics({**types, **more}, named, path)
+    with pytest.raises(LogError, match="topics for the pose: none of geometry_msgs"):
+        choose_topics({"/ft": WRENCH}, {}, path)
+
+
+def test_bad_bags_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / name).write_bytes(b"this is no bag")
+    for name, expected in (
+        ("none.bag", "no such file"),
+        ("folder", "is a folder without metadata.yaml"),
+        ("a.bag", "cannot be read as a bag"),
+        ("a.mcap", "cannot be read as a bag"),
+        ("a.db3", "cannot be read as a bag"),
+    ):
+        with pytest.raises(LogError, match=expected) as caught:
+            read_bag(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="expected pose=, wrench= or command=TOPIC"):
+        read_bag(tmp_path / "a.bag", ("pose",))

@@ -51,7 +51,7 @@ def diagnose_episodes(config: Diagnose) -> int:
     from torch.utils.tensorboard import SummaryWriter
 
     from tpcd.commands.diagnosing import EXIT_CODES, compare_runs, write_diagnosis
-    from tpcd.data import check_episode, read_episode
+    from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.model import Model, load_effects, load_model
     from tpcd.results import format_table, run_folder, write_results
@@ -61,18 +61,23 @@ def diagnose_episodes(config: Diagnose) -> int:
         print(format_table(compare_runs(config.compare)))
         return 0
     torch.set_num_threads(1)
-    episodes = [read_episode(path) for path in config.episodes]
-    fresh = [read_episode(path) for path in config.fresh]
-    for episode in (*episodes, *fresh):
-        for warning in check_episode(episode):
-            print(f"warning: {warning}", file=sys.stderr)
+    data = read_data(config.episodes, config.fresh)
+    for warning in data.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    for note in data.notes:
+        print(f"note: {note}")
     shape = load_prior(config.prior)
     model = Model() if config.model is None else load_model(config.model)
     own = [effect for path in config.candidates for effect in load_effects(path)]
     settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
     settings = replace(settings, catalogue=(*settings.catalogue, *own))
     with run_folder(config.out, "scripts/diagnose.py", config, config.overwrite) as folder:
-        found = diagnose(episodes, shape, settings, fresh, model.effects, tell=_tell)
+        if data.answer is not None:
+            found = data.answer
+            _tell(f"verdict: not enough information: {found.sentence}")
+        else:
+            found = diagnose(data.episodes, shape, settings, data.fresh, model.effects, tell=_tell)
+        found = replace(found, notes=(*data.notes, *found.notes))
         rows = [
             {
                 "channel": f"{gap.channel} [{gap.unit}]",
@@ -86,7 +91,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         if rows:
             print(f"\none-step errors on {found.held_out}\n{format_table(rows)}")
         with SummaryWriter(folder / "tensorboard") as writer:
-            write_diagnosis(found, episodes, settings.least_gain, config.prior, folder, writer)
+            write_diagnosis(found, data.episodes, settings.least_gain, config.prior, folder, writer)
         write_results(folder, rows, seeds=[config.seed])
     print(f"\nreport in {config.out}/report.html, verdict in {config.out}/verdict.json", end="")
     if found.effects:

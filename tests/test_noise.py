@@ -1,0 +1,161 @@
+"""Noise of the sensors from the data alone: what it is, and when what is stated cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2
+
+from tpcd.data.episode import Episode, write_episode
+from tpcd.data.noise import check_noise, estimate_noise, read_noisy, resolution
+from tpcd.effects import CATALOGUE
+from tpcd.errors import EpisodeError
+from tpcd.random import stream
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.recording import DEFAULT_SENSOR_STD, make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+STD = np.array(DEFAULT_SENSOR_STD)
+SEEDS = range(6)
+LEVEL = 1e-4
+"""False-alarm rate of each comparison with a distribution."""
+SIZES: dict[str, dict[str, float]] = {
+    "command_lag": {"share": 0.1},
+    "stiffness_error": {"log_ratio_x": 0.1, "log_ratio_z": -0.08},
+    "arm_friction": {"force": 0.3},
+    "payload": {"weight": 1.0, "lever": 0.03},
+    "force_bias": {"F_x": 0.6, "F_z": -0.9, "tau": 0.03},
+    "force_drift": {"F_x": 1.0, "F_z": -1.2},
+    "force_gain": {"gain": 0.08},
+    "sensor_rotation": {"angle": 0.08},
+    "wrench_reference_point": {"x": 0.02, "z": -0.01},
+    "grasp_slip": {"angle": 0.03, "at": 0.5},
+    "floor_compliance": {"compliance": 2.5e-4},
+}
+"""Medium sizes of what arm, sensors, grasp and floor may do."""
+
+
+@cache
+def episode_of(seed: int, steps: int = 60, effect: str = "") -> Episode:
+    names = sorted(builtin_outlines())
+    name = names[seed % len(names)]
+    scene = draw_scene(name, builtin_outlines()[name].vertices, stream(seed, 0))
+    hidden = {effect: SIZES[effect]} if effect else {}
+    truth = make_truth(scene, "quasistatic", hidden, steps)
+    motion = make_motion("diagnosis", scene, steps, stream(seed, 1))
+    return record(truth, scene, motion, steps, stream(seed, 2)).measured
+
+
+def stated(episode: Episode, factor: float, channels: slice) -> Episode:
+    std = episode.sensor_std.clone()
+    std[channels] *= factor
+    return replace(episode, sensor_std=std)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_noise_of_sixty_steps_is_found(seed: int) -> None:
+    found = estimate_noise([episode_of(seed)])
+    assert found is not None
+    freedom = np.array(found.freedom)
+    assert freedom.min() >= 12
+    # One in five counts for nothing: rows are chosen by what they read.
+    low, high = (np.sqrt(chi2.ppf(p, freedom) / freedom) for p in (LEVEL / 2, 1 - LEVEL / 2))
+    ratio = np.array(found.std) / STD
+    assert (ratio > 0.8 * low).all() and (ratio < 1.25 * high).all(), ratio
+
+
+def test_episodes_together_say_more() -> None:
+    together = estimate_noise([episode_of(seed) for seed in SEEDS])
+    alone = estimate_noise([episode_of(0)])
+    assert together is not None and alone is not None
+    assert min(together.freedom) > 4 * min(alone.freedom)
+    assert np.allclose(np.array(together.std) / STD, 1.0, atol=0.2)
+    assert "good to about 7%" in together.sentence() or "good to about 6%" in together.sentence()
+
+
+def test_what_is_stated_does_not_matter_to_the_estimate() -> None:
+    episode = episode_of(1)
+    assert estimate_noise([episode]) == estimate_noise([stated(episode, 50.0, slice(0, 6))])
+
+
+def test_without_repeated_commands_there_is_no_estimate() -> None:
+    assert estimate_noise([episode_of(0, steps=15)]) is None
+
+
+def test_readings_without_any_scatter_have_the_noise_of_rounding() -> None:
+    episode = episode_of(0)
+    poses = (episode.poses / 0.002).round() * 0.002
+    found = estimate_noise([replace(episode, poses=poses)])
+    assert found is not None and found.std[0] >= 0.002 / np.sqrt(12.0) - 1e-12
+    assert resolution(np.ones(5)) == 0.0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_right_noise_is_not_doubted(seed: int) -> None:
+    for steps in (15, 30, 60):
+        assert check_noise(episode_of(seed, steps)) == []
+    double, half = (stated(episode_of(seed), f, slice(0, 6)) for f in (1.5, 1 / 1.5))
+    assert check_noise(double) == [] and check_noise(half) == []
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("channels", [slice(0, 3), slice(3, 6)], ids=["pose", "wrench"])
+def test_ten_times_too_large_is_refused(seed: int, channels: slice) -> None:
+    with pytest.raises(EpisodeError, match="plainly too large") as caught:
+        check_noise(stated(episode_of(seed), 10.0, channels))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_ten_times_too_small_is_refused_or_said(seed: int) -> None:
+    with pytest.raises(EpisodeError, match="w - K .* plainly too small"):
+        check_noise(stated(episode_of(seed), 0.1, slice(3, 6)))
+    told = check_noise(stated(episode_of(seed), 0.1, slice(0, 3)))
+    assert told and all("too small, or the arm creeps or lags" in line for line in told)
+
+
+@pytest.mark.parametrize("effect", SIZES)
+def test_no_effect_is_taken_for_wrong_noise(effect: str) -> None:
+    assert effect in {known.name for known in CATALOGUE}
+    for seed in (0, 1):
+        told = check_noise(episode_of(seed, effect=effect))
+        if effect == "command_lag":  # it shows in pauses, as noise does
+            assert all("too small, or the arm creeps or lags" in line for line in told)
+        else:
+            assert told == []
+
+
+def silent(path: Path) -> Path:
+    """The episode without what its YAML says of noise."""
+    header = path.with_suffix(".yaml")
+    lines = header.read_text().splitlines()
+    header.write_text("\n".join(line for line in lines if not line.startswith("sensor_std")))
+    return path
+
+
+def test_missing_noise_is_taken_from_the_data_or_from_the_others(tmp_path: Path) -> None:
+    first, second = (write_episode(episode_of(seed), tmp_path / f"e{seed}.csv") for seed in (0, 1))
+    for path in (first, second):
+        silent(path)
+    episodes, (note,) = read_noisy([first, second])
+    assert torch.equal(episodes[0].sensor_std, episodes[1].sensor_std)
+    assert np.allclose(episodes[0].sensor_std.numpy() / STD, 1.0, atol=0.4)
+    assert note.startswith(f"{tmp_path}/e0.yaml, {tmp_path}/e1.yaml: sensor_std estimated as [")
+    known = write_episode(episode_of(2), tmp_path / "e2.csv")
+    episodes, (note,) = read_noisy([first, known])
+    assert torch.equal(episodes[0].sensor_std, episode_of(2).sensor_std)
+    assert "sensor_std taken from" in note
+
+
+def test_missing_noise_that_nothing_shows_names_the_motion_that_would(tmp_path: Path) -> None:
+    short = silent(write_episode(episode_of(0, steps=15), tmp_path / "short.csv"))
+    with pytest.raises(EpisodeError, match="repeat commands in free space and in contact"):
+        read_noisy([short])
+    lagging = silent(write_episode(episode_of(0, effect="command_lag"), tmp_path / "lag.csv"))
+    with pytest.raises(EpisodeError, match="creeps or lags in pauses"):
+        read_noisy([lagging])

@@ -1,0 +1,92 @@
+"""What a diagnosis is given: episodes of one set-up whose noise is known and not plainly wrong.
+
+Noise that no YAML states is estimated from repeated commands; a recording without set points gets
+its answer here, since there is nothing to fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tpcd.data.checks import check_episode
+from tpcd.data.episode import Episode, locate
+from tpcd.data.header import Header, read_header
+from tpcd.data.measured import read_measured
+from tpcd.data.noise import check_noise, read_noisy
+from tpcd.discrepancy.diagnosis import Diagnosis
+from tpcd.errors import EpisodeError
+
+ONE_SET_UP = "episodes of one run must come from one set-up, so diagnose them apart"
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Episodes that are ready for a diagnosis, or its answer where there can be none."""
+
+    episodes: tuple[Episode, ...]
+    fresh: tuple[Episode, ...]
+    notes: tuple[str, ...] = ()
+    """What was done about the noise, and doubts about it; part of the verdict."""
+    warnings: tuple[str, ...] = ()
+    """What else looks odd about the episodes."""
+    answer: Diagnosis | None = None
+    """The verdict where nothing can be fitted."""
+
+
+def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
+    """Read and check the episodes of a diagnosis.
+
+    Raises `EpisodeError` for files that cannot be read, for episodes of different set-ups, and for
+    noise that is plainly wrong, or neither stated nor shown by the data.
+    """
+    places = [locate(Path(path)) for path in (*paths, *fresh)]
+    headers = [read_header(header) for _, header in places]
+    check_one_set_up([header for _, header in places], headers)
+    for (table, _), header in zip(places, headers, strict=True):
+        if not header.commands_known:
+            return Data((), (), answer=_without_commands(table, header))
+    episodes, notes = read_noisy((*paths, *fresh))
+    told = [line for episode in episodes for line in check_noise(episode)]
+    warnings = [line for episode in episodes for line in check_episode(episode)]
+    count = len(paths)
+    return Data(tuple(episodes[:count]), tuple(episodes[count:]), (*notes, *told), tuple(warnings))
+
+
+def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:
+    """Refuse episodes whose YAMLs differ in what makes a set-up; raises `EpisodeError`.
+
+    Where one of them says nothing of noise, object or time step, it takes the others'.
+    """
+    for name in ("stiffness", "sensor_std", "object", "time_step_s", "priors"):
+        first: tuple[Path, object] | None = None
+        for path, header in zip(paths, headers, strict=True):
+            value = getattr(header, name)
+            if value is None:
+                continue
+            if first is None:
+                first = path, value
+            elif value != first[1]:
+                raise EpisodeError(
+                    path,
+                    f"{name} is {_shown(value)}, but {_shown(first[1])} in {first[0]}",
+                    ONE_SET_UP,
+                )
+
+
+def _without_commands(table: Path, header: Header) -> Diagnosis:
+    noise = "" if header.sensor_std else "; nor is the noise of the sensors known"
+    return Diagnosis(
+        "not_enough_information",
+        f"the set points of the controller were not recorded in {table.name}, so it is unknown"
+        " what the springs K (x - u) push with and which motion was asked for;"
+        f" {read_measured(table).summary()}{noise}; a diagnosis needs commands, a free start,"
+        " and contacts that are made, pressed at several loads, slid and broken",
+    )
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(f'{entry:g}' for entry in value)}]"
+    return f"{value!r}" if value or isinstance(value, str) else "nothing"

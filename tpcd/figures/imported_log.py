@@ -71,13 +71,15 @@ def imported_log(
         panel.set_ylabel(axis_label(_LABELS[i], CHANNEL_UNITS[i]))
         title(panel, "rows should lie on the line" if i == 3 else "")
     outside = (
-        ("motion", "m", motion_left_out[:, 0]),
-        ("rotation", "rad", motion_left_out[:, 1]),
-        ("force", "N", wrench_left_out[:, 0]),
+        ("motion", "m", motion_left_out[:, 0], 1e-4),
+        ("rotation", "rad", motion_left_out[:, 1], 1e-3),
+        ("force", "N", wrench_left_out[:, 0], 0.1),
     )
-    for panel, (name, unit, values) in zip(axes[-3:], outside, strict=True):
+    for panel, (name, unit, values, least) in zip(axes[-3:], outside, strict=True):
         factor, _ = display_unit(unit)
         panel.plot(times[thin], factor * values[thin], color=SERIES[3], linewidth=0.8)
+        low, high = min(values.min(), -least), max(values.max(), least)
+        panel.set_ylim(1.1 * factor * low, 1.1 * factor * high)
         panel.set_ylabel(axis_label(name, unit))
         panel.set_xlabel("time [s]")
         title(panel, f"{name} out of the plane, left out")

@@ -47,9 +47,9 @@ def left_out(planar: PlanarLog) -> Account:
     torque = np.abs(planar.wrench_left_out[:, 1:]).max()
     held = np.linalg.norm(planar.wrenches[:, :2], axis=1).max()
     finding = (
-        f"the plane leaves out {1e3 * outside:.2g} mm of motion (within it {1e3 * inside:.3g} mm),"
-        f" {math.degrees(swing):.2g} degrees of rotation, {force:.2g} N of force (within it"
-        f" {held:.3g} N) and {torque:.2g} N·m of torque"
+        f"the plane leaves out {_told(1e3 * outside)} mm of motion (within it {1e3 * inside:.3g}"
+        f" mm), {_told(math.degrees(swing))} degrees of rotation, {_told(force)} N of force (within"
+        f" it {held:.3g} N) and {_told(torque)} N·m of torque"
     )
     doubts = []
     if outside > OUT_OF_PLANE_MOTION * inside:
@@ -111,3 +111,8 @@ def spring_wrench(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Float
     away = settled.rows[:, :3] - settled.commands
     away[:, 2] = np.remainder(away[:, 2] + math.pi, 2 * math.pi) - math.pi
     return stiffness * away
+
+
+def _told(value: float) -> str:
+    """A number for people; what is below any sensor is 0."""
+    return f"{value:.2g}" if abs(value) > 1e-6 else "0"

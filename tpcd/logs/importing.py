@@ -109,7 +109,9 @@ def import_log(log: Log, choices: Importing) -> Imported:
     extra = _extra(log, settled)
     if settled.commands is None:
         content = Measured(settled.rows[:, :3], settled.rows[:, 3:], extra)
-        doubts.insert(0, "no set points in the map: steps cannot be told apart, and nothing can be learnt")
+        doubts.insert(
+            0, "no set points in the map: steps cannot be told apart, and nothing can be learnt"
+        )
         findings.append(content.summary())
         spring = spring_wrench(settled, stiffness)
         account = Account(tuple(findings), tuple(doubts))

@@ -14,7 +14,6 @@ from tpcd.logs.columns import log_from_columns
 from tpcd.logs.table import read_columns
 from tpcd.robot.emulator.process import running_emulator
 
-
 READ = ["timestamp", "actual_TCP_pose", "actual_TCP_force", "target_TCP_pose", "actual_q"]
 
 

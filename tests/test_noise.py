@@ -21,7 +21,7 @@ from tpcd.truth.recording import DEFAULT_SENSOR_STD, make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
 STD = np.array(DEFAULT_SENSOR_STD)
-SEEDS = range(6)
+SEEDS = range(4)
 LEVEL = 1e-4
 """False-alarm rate of each comparison with a distribution."""
 SIZES: dict[str, dict[str, float]] = {
@@ -63,9 +63,9 @@ def test_the_noise_of_sixty_steps_is_found(seed: int) -> None:
     assert found is not None
     freedom = np.array(found.freedom)
     assert freedom.min() >= 12
-    # One in five counts for nothing: rows are chosen by what they read.
+    # Rows are chosen by what they read, so a fifth more or less is no surprise.
     low, high = (np.sqrt(chi2.ppf(p, freedom) / freedom) for p in (LEVEL / 2, 1 - LEVEL / 2))
-    ratio = np.array(found.std) / STD
+    ratio = np.array(found.std) / STD / (1 + 1 / np.sqrt(2 * freedom))
     assert (ratio > 0.8 * low).all() and (ratio < 1.25 * high).all(), ratio
 
 
@@ -73,9 +73,10 @@ def test_episodes_together_say_more() -> None:
     together = estimate_noise([episode_of(seed) for seed in SEEDS])
     alone = estimate_noise([episode_of(0)])
     assert together is not None and alone is not None
-    assert min(together.freedom) > 4 * min(alone.freedom)
+    assert min(together.freedom) > 3 * min(alone.freedom)
     assert np.allclose(np.array(together.std) / STD, 1.0, atol=0.2)
-    assert "good to about 7%" in together.sentence() or "good to about 6%" in together.sentence()
+    error = 1 / np.sqrt(2 * min(together.freedom))
+    assert f"good to about {error:.0%}" in together.sentence()
 
 
 def test_what_is_stated_does_not_matter_to_the_estimate() -> None:
@@ -101,6 +102,23 @@ def test_right_noise_is_not_doubted(seed: int) -> None:
         assert check_noise(episode_of(seed, steps)) == []
     double, half = (stated(episode_of(seed), f, slice(0, 6)) for f in (1.5, 1 / 1.5))
     assert check_noise(double) == [] and check_noise(half) == []
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rounded_readings_are_not_doubted(seed: int) -> None:
+    def rounded(values: torch.Tensor, steps: list[float]) -> torch.Tensor:
+        grid = torch.tensor(steps, dtype=torch.float64)
+        return (values / grid).round() * grid
+
+    # Steps as large as the noise, commands on the same grid.
+    episode, steps = episode_of(seed), [2e-4, 2e-4, 5e-4]
+    coarse = replace(
+        episode,
+        commands=rounded(episode.commands, steps),
+        poses=rounded(episode.poses, steps),
+        wrenches=rounded(episode.wrenches, [0.3, 0.3, 0.02]),
+    )
+    assert check_noise(coarse) == []
 
 
 @pytest.mark.parametrize("seed", SEEDS)

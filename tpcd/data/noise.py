@@ -31,8 +31,9 @@ NEEDED_MOTION = (
     " scripts/plan_diagnosis.py do), or hold the arm still without contact for about 10 s and give"
     " sensor_std: the standard deviation of x, z [m], phi [rad], F_x, F_z [N], tau [N·m]"
 )
-CLIP = 4.0
-"""Rows this many standard deviations from where they were sent are not free."""
+CLIP, ROUNDS = 5.0, 10
+"""Rows this many standard deviations from where they were sent are not free; who is free and how
+much they scatter is settled in so many rounds at most."""
 CURVES = 7
 """Terms that are fitted away from w - K (x - u)."""
 POSES_SHARE = 0.2
@@ -41,17 +42,21 @@ SURE, LIKELY = 1e-6, 1e-4
 """Probabilities below which stated noise is refused, or warned of."""
 TOO_LARGE, TOO_SMALL = 1 / 3, 3.0
 """Scatter over stated noise beyond which it is plainly wrong."""
-NEAR, NEAR_SHARE = 0.2, 0.1586
-"""A normal number is within 0.2 sd of anywhere with at most this probability."""
+NEAR = 0.2
+"""Readings count as near where they would be within so many standard deviations."""
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """One standard deviation of x, z, phi, F_x, F_z, tau, and what it rests on."""
+    """Noise of x, z, phi, F_x, F_z, tau, and what it rests on.
+
+    One standard error is added, for noise that is taken too small looks like physics.
+    """
 
     std: tuple[float, ...]
+    """One standard deviation, and its standard error."""
     freedom: tuple[int, ...]
-    """Degrees of freedom; the relative error of `std` is about 1 / sqrt(2 freedom)."""
+    """Degrees of freedom; the relative standard error is about 1 / sqrt(2 freedom)."""
 
     def sentence(self) -> str:
         """The estimate in words, ready for a YAML."""
@@ -59,7 +64,7 @@ class NoiseEstimate:
         error = 1 / math.sqrt(2 * min(self.freedom))
         return (
             f"sensor_std estimated as [{values}] from repeated commands, free rows and"
-            f" w - K (x - u); good to about {error:.0%}"
+            f" w - K (x - u); good to about {error:.0%}, which is added"
         )
 
 
@@ -82,20 +87,23 @@ def estimate_noise(episodes: Sequence[Episode]) -> NoiseEstimate | None:
     std = np.maximum(np.sqrt(squares / freedom), least)
     counts = np.full(6, freedom)
     away = np.concatenate([_away(episode)[1:] for episode in episodes])
-    free = (np.abs(away) <= CLIP * std[:3]).all(1)
-    if free.sum() > 1:
-        wrenches = np.concatenate([episode.wrenches.numpy()[1:] for episode in episodes])[free]
-        squares = squares + np.append(
-            (away[free] ** 2).sum(0), ((wrenches - wrenches.mean(0)) ** 2).sum(0)
-        )
-        counts += np.array([free.sum()] * 3 + [free.sum() - 1] * 3)
-        std = np.maximum(np.sqrt(squares / counts), least)
+    wrenches = np.concatenate([episode.wrenches.numpy()[1:] for episode in episodes])
+    free = np.zeros(len(away), dtype=bool)
+    for _ in range(ROUNDS):
+        before, free = free, (np.abs(away) <= CLIP * std[:3]).all(1)
+        if free.sum() < 2 or (free == before).all():
+            break
+        own = wrenches[free] - wrenches[free].mean(0)
+        together = squares + np.append((away[free] ** 2).sum(0), (own**2).sum(0))
+        counts = freedom + np.array([free.sum()] * 3 + [free.sum() - 1] * 3)
+        std = np.maximum(np.sqrt(together / counts), least)
     variance, rest = _parity(episodes)
     of_poses = (episodes[0].stiffness.numpy() * std[:3]) ** 2
     for axis in np.flatnonzero(of_poses < POSES_SHARE * variance):
         # All rows speak, and little of it has to be taken away.
         std[3 + axis] = max(math.sqrt(variance[axis] - of_poses[axis]), least[3 + axis])
         counts[3 + axis] = rest
+    std = std * (1.0 + 1.0 / np.sqrt(2.0 * counts))
     return NoiseEstimate(tuple(std.tolist()), tuple(counts.tolist()))
 
 
@@ -156,9 +164,13 @@ def check_noise(episode: Episode) -> list[str]:
     for name, k, ratio, freedom, _ in measured:
         if stated[k] <= 0:
             continue
+        step = resolution(readings[:, k]) / stated[k]
         near = int((away[:, k] < NEAR * stated[k]).sum())
-        by_share = binom.sf(near - 1, len(away), NEAR_SHARE) < SURE
-        by_scatter = ratio < TOO_LARGE and chi2.cdf(ratio**2 * freedom, freedom) < SURE
+        # A normal number is never likelier to come so near to anything, rounded or not.
+        share = math.erf((NEAR + step / 2) / math.sqrt(2.0))
+        by_share = binom.sf(near - 1, len(away), share) < SURE
+        least = max(ratio, step / math.sqrt(12.0))
+        by_scatter = least < TOO_LARGE and chi2.cdf(least**2 * freedom, freedom) < SURE
         if by_share or by_scatter:
             found = (
                 f"{near} of {len(away)} rows lie within a fifth of it of where they would be"

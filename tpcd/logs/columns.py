@@ -156,7 +156,7 @@ def log_from_columns(
         turned, other = _rotations(values, "u_", euler, path)
         if turned is None:
             notes.append("no rotation of the set point in the map: taken as that of the start")
-            turned = Rotation.concatenate([rotations[:1]] * len(rotations))
+            turned = Rotation.from_quat(np.tile(rotations[:1].as_quat(), (len(rotations), 1)))
         elif other != kind:
             notes.append(f"rotations are read from {kind}, those of the set point from {other}")
     log = Log(

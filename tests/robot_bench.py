@@ -15,7 +15,7 @@ from tpcd.robot.emulator.process import running_emulator
 from tpcd.robot.ur import UniversalRobot
 
 _COUNT = itertools.count(1)
-SURFACE = 3.0
+SURFACE = 5.0
 """Yield of floor and wall [mm per 10 N]: soft, so that the arm settles soon."""
 
 
@@ -29,7 +29,7 @@ def emulator_settings(**changed: Any) -> EmulatorSettings:
     """An emulator at the client's pace with a mug in its hand."""
     settings: dict[str, Any] = {
         "address": free_address(), "outline": "mug", "seed": 1, "pace": "client",
-        "surface_mm_per_10n": SURFACE, "fault_after": 8.0,
+        "surface_mm_per_10n": SURFACE, "fault_after": 12.0,
     }  # fmt: skip
     return EmulatorSettings(**{**settings, **changed})
 

@@ -21,9 +21,9 @@ LARGEST_FREE = 2.0
 LARGEST_DRIFT = 0.15
 """Of a force in free air [N/s]."""
 TILT = 0.1
-"""Angle by which the tool is tilted both ways [rad]."""
-LARGEST_TILTED = 0.6
-"""Difference of the forces at both tilts [N]; 0.3 kg of wrong payload."""
+"""Angle to which the tool is tilted both ways, within the workspace [rad]."""
+LARGEST_MASS = 0.3
+"""Payload that may be missing or too much [kg]."""
 GRAVITY = 9.81
 
 
@@ -80,12 +80,13 @@ def check_zeroed(air: FreeAir) -> None:
 def check_tilted(left: FreeAir, right: FreeAir) -> float:
     """The force that turns with the tool, each way [N]; raises RobotError for a wrong payload."""
     difference = float(np.linalg.norm((right.wrenches.mean(0) - left.wrenches.mean(0))[:2]))
-    if difference > LARGEST_TILTED:
-        mass = difference / (2 * TILT * GRAVITY)
+    angle = abs(float(right.poses[:, 2].mean() - left.poses[:, 2].mean()))
+    allowed = LARGEST_MASS * GRAVITY * angle
+    if difference > allowed:
         raise RobotError(
-            f"the force changes by {difference:.2f} N when the tool tilts by ±{TILT:g} rad in free"
-            f" air, expected at most {LARGEST_TILTED:g} N; the payload is wrong by about"
-            f" {mass:.2f} kg"
+            f"the force changes by {difference:.2f} N when the tool turns by {angle:.2f} rad in"
+            f" free air, expected at most {allowed:.2f} N; the payload is wrong by about"
+            f" {difference / (GRAVITY * angle):.2f} kg"
         )
     return difference / 2
 

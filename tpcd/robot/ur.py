@@ -119,7 +119,10 @@ class UniversalRobot:
             )
         with self._watched("preflight_resumed"):
             self._check_free_air()
-            self._ramp_to(episode.poses[0].numpy())
+            first = episode.poses[0].numpy()
+            over = np.array([first[0], max(first[1], planar_pose(self._frame, tcp)[1]), first[2]])
+            self._ramp_to(over)
+            self._ramp_to(first)
             self._require_link().zero_sensor()
             self._stand(self._settling.window)
         length, angle = self.settings.resume_tolerance
@@ -188,8 +191,11 @@ class UniversalRobot:
         above[1] = min(above[1], settings.workspace_high[1])
         self._ramp_to(above)
         tilted = []
-        for angle in (-preflight.TILT, preflight.TILT):
-            self._ramp_to(above + np.array([0.0, 0.0, angle]))
+        for limit, angle in zip(
+            (settings.workspace_low, settings.workspace_high), (-1, 1), strict=True
+        ):
+            tilt = angle * min(abs(limit[2]), preflight.TILT)
+            self._ramp_to(np.array([above[0], above[1], tilt]))
             tilted.append(self._stand(0.6))
         turning = preflight.check_tilted(*tilted)
         self._ramp_to(above)

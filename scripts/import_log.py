@@ -189,7 +189,11 @@ def _ask(picture: Path) -> bool:
 
     if not sys.stdin.isatty():
         return False
-    return input(f"drawn in {picture}; write the episode? [y/N] ").strip().lower() in ("y", "yes")
+    try:
+        answer = input(f"drawn in {picture}; write the episode? [y/N] ")
+    except EOFError:
+        return False
+    return answer.strip().lower() in ("y", "yes")
 
 
 if __name__ == "__main__":

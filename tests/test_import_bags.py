@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -185,3 +186,12 @@ def test_bad_bags_are_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="expected pose=, wrench= or command=TOPIC"):
         read_bag(tmp_path / "a.bag", ("pose",))
+
+
+def test_without_rosbags_the_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.bag").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(LogError, match=r"bags need rosbags; pip install 'tpcd\[bags\]'"):
+        read_bag(tmp_path / "a.bag")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,13 +18,15 @@ from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
+from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.report_parts import shown_value
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.effects import find_effect
 from tpcd.effects.protocol import EffectParameter
+from tpcd.errors import RunError
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings
+from tpcd.simulator import QuasistaticTruth, StepSettings
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -78,6 +81,61 @@ def test_a_soft_floor_is_named_with_its_size_and_the_gap_shrinks(shape: PolygonS
     assert (
         found.belief is not None and found.belief.prior.names[-1] == "floor_compliance.compliance"
     )
+
+
+def test_an_object_larger_than_any_of_the_prior_is_no_effect(shape: PolygonShape) -> None:
+    generator = torch.Generator().manual_seed(6)
+    outline = builtin_outlines()["mug"].vertices
+    scene = draw_scene("mug", 2.2 * outline, generator)
+    motion = make_motion("diagnosis", scene, 30, generator)
+    truth = make_truth(scene, "quasistatic", {}, 30)
+    episode = record(truth, scene, motion, 30, generator).measured
+    told: list[str] = []
+    found = diagnose([episode], shape, SMALL, tell=told.append)
+    assert found.verdict == "nothing_missing", found.sentence
+    assert "unlike those of the shape prior" in found.shape
+    scale = next(e for e in found.theta_after if e.name == "scale")
+    assert abs(scale.value - 2.2 * scene.theta["scale"]) < 0.1
+    assert found.unexplained_before > 0.2 > found.unexplained_after
+
+
+def test_a_simulator_that_lifts_what_slides_is_called_numerics(shape: PolygonShape) -> None:
+    generator = torch.Generator().manual_seed(7)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    scene = replace(scene, friction=0.6)
+    truth = QuasistaticTruth(
+        *(scene.vertices_ee, scene.friction, scene.floor_height, scene.wall_position),
+        *(scene.stiffness, StepSettings(friction="anitescu", substeps=1)),
+    )
+    truth.reset(scene.start_pose)
+    motion = make_motion("diagnosis", scene, 30, generator)
+    episode = record(truth, scene, motion, 30, generator).measured
+    found = diagnose([episode], shape, replace(SMALL, catalogue=()))
+    assert found.names == ("numerics",) and found.verdict == "named"
+    assert found.belief is not None and found.belief.step.friction == "anitescu"
+
+
+def test_a_diagnosis_that_was_stopped_goes_on_with_the_fits_it_had(
+    shape: PolygonShape, clean: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
+    kept = sorted(tmp_path.iterdir())
+    assert len(kept) > 4
+
+    def never(*arguments: object) -> None:
+        raise AssertionError("a fit was made again")
+
+    monkeypatch.setattr("tpcd.discrepancy.evidence._fitted", never)
+    monkeypatch.setattr("tpcd.discrepancy.screening._peak", never)
+    again = diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
+    assert again.log_evidence == whole.log_evidence and again.candidates == whole.candidates
+    assert again.theta_after == whole.theta_after
+    # Other data are another question.
+    with pytest.raises(AssertionError, match="made again"):
+        diagnose([clean.first(25)], shape, SMALL, memory=Memory(tmp_path))
+    kept[0].write_bytes(b"half")
+    with pytest.raises(RunError, match="cannot be read"):
+        diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
 
 
 def test_a_short_episode_is_not_enough(shape: PolygonShape, clean: Episode) -> None:

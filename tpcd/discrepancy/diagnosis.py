@@ -50,6 +50,8 @@ class Candidate:
 
     name: str
     round: int
+    """From 1; 0 for other base models."""
+    """From 1; 0 for another base model."""
     gain: float
     """Log evidence minus that of the model of the round before."""
     by_seed: tuple[float, ...] = ()
@@ -133,6 +135,8 @@ class Diagnosis:
     unexplained_after: float = float("nan")
     theta_before: tuple[Estimate, ...] = ()
     theta_after: tuple[Estimate, ...] = ()
+    shape: str = ""
+    """What the data say of the outline beyond the shape prior."""
     detection_limits: tuple[Limit, ...] = ()
     coverage: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

@@ -28,6 +28,7 @@ from tpcd.belief.pool import known_weights, truncate
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.resampling import systematic_resample
 from tpcd.belief.target import ContactTarget
+from tpcd.discrepancy.memory import Memory, digest
 from tpcd.effects.protocol import Effect
 from tpcd.random import stream
 from tpcd.simulator import StepSettings
@@ -54,6 +55,19 @@ class Question:
     step: StepSettings
     sampler: SamplerSettings = FIT_SAMPLER
     seed: int = 0
+    memory: Memory = Memory()
+    """Where fits are kept."""
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of all that answers depend on."""
+        history, scene = self.history, self.scene
+        return digest(
+            *(history.commands, history.readings, history.sensor_variance, history.stiffness),
+            *(history.used, history.seams, history.parity_counts, scene.low, scene.high),
+            *(type(scene.shape).__name__, scene.shape.latent_dim, scene.shape.misfit_sd),
+            *(self.misfit, self.step, self.sampler, self.seed),
+        )
 
 
 @dataclass(frozen=True)
@@ -77,6 +91,12 @@ class Fit:
     def names(self) -> tuple[str, ...]:
         """Names of the effects."""
         return tuple(effect.name for effect in self.effects)
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the model and what was found."""
+        bounds = (self.prior.low, self.prior.high)
+        return digest(self.names, self.by_seed, self.step, *bounds, self.cloud.positions)
 
     @property
     def log_evidence(self) -> float:
@@ -104,31 +124,45 @@ def fit_model(
     prior = question.scene.with_effects(effects)
     step = question.step if step is None else step
     target = ContactTarget(prior, question.misfit, step, question.history)
-    by_seed, clouds = [], []
+    names = tuple(effect.name for effect in effects)
+    model = (question.fingerprint, names, prior.low, prior.high, step)
+    begun = tuple(fit.fingerprint for fit in start)
+    clouds = []
     for seed in seeds:
         generator = fit_stream(question, effects, seed)
-        begin = start_cloud(target.sample(question.sampler.particles, generator))
-        remembered = [carried(fit, prior, generator) for fit in start]
-        remembered.append(_early_modes(target, question.sampler, generator))
-        begin = replace(begin, modes=torch.cat(remembered))
-        pool = draw_pool(begin, target, 1, question.sampler, generator)
-        weights = truncate(known_weights(pool.log_weights))
-        index, counts = systematic_resample(weights, question.sampler.particles, generator).unique(
-            return_counts=True
-        )
-        by_seed.append(pool.log_evidence)
-        clouds.append(
-            Cloud(
-                pool.positions[index],
-                counts.double() / question.sampler.particles,
-                pool.log_likelihood[index],
-                pool.log_evidence,
-                pool.log_evidence_std,
-                pool.modes,
-                pool.shares,
-            )
-        )
-    return Fit(effects, step, prior, tuple(by_seed), tuple(clouds))
+
+        def work(generator: torch.Generator = generator) -> Cloud:
+            return _fitted(target, question.sampler, start, generator)
+
+        clouds.append(question.memory.recall((*model, begun, seed), Cloud, work))
+    return Fit(effects, step, prior, tuple(c.log_evidence for c in clouds), tuple(clouds))
+
+
+def _fitted(
+    target: ContactTarget,
+    sampler: SamplerSettings,
+    start: Sequence[Fit],
+    generator: torch.Generator,
+) -> Cloud:
+    """The particles of one seed."""
+    begin = start_cloud(target.sample(sampler.particles, generator))
+    remembered = [carried(fit, target.prior, generator) for fit in start]
+    remembered.append(_early_modes(target, sampler, generator))
+    begin = replace(begin, modes=torch.cat(remembered))
+    pool = draw_pool(begin, target, 1, sampler, generator)
+    weights = truncate(known_weights(pool.log_weights))
+    index, counts = systematic_resample(weights, sampler.particles, generator).unique(
+        return_counts=True
+    )
+    return Cloud(
+        pool.positions[index],
+        counts.double() / sampler.particles,
+        pool.log_likelihood[index],
+        pool.log_evidence,
+        pool.log_evidence_std,
+        pool.modes,
+        pool.shares,
+    )
 
 
 def _early_modes(
@@ -173,7 +207,7 @@ def carried(
     best = fit.cloud.weights.argsort(descending=True)[:count]
     places = fit.cloud.positions[best]
     scene = prior.scene_dimension
-    columns = [places[:, :scene]]
+    columns = [_rescaled(places[:, :scene], fit.prior, prior)]
     own = dict(zip(fit.prior.names[scene:], places[:, scene:-1].T, strict=True))
     null = torch.cat((prior.low[:scene], _null(prior)))
     null_score = prior.to_score(null)[scene:].clamp(-_WITHIN, _WITHIN)
@@ -182,6 +216,19 @@ def carried(
         drawn[::2] = null_score[k]
         columns.append(own.get(name, drawn)[:, None])
     return torch.cat((*columns, places[:, -1:]), dim=-1)
+
+
+def _rescaled(
+    score: Float[Tensor, "k d"], before: ParameterPrior, now: ParameterPrior
+) -> Float[Tensor, "k d"]:
+    """Coordinates of the scene where the prior of some entries is another one."""
+    scene = slice(0, score.shape[-1])
+    (low, high), (least, most) = ((p.low[scene], p.high[scene]) for p in (before, now))
+    if torch.equal(low, least) and torch.equal(high, most):
+        return score
+    place = low + (high - low) * torch.special.ndtr(score)
+    share = ((place - least) / (most - least)).clamp(1e-9, 1 - 1e-9)
+    return torch.where((low == least) & (high == most), score, torch.special.ndtri(share))
 
 
 def _null(prior: ParameterPrior) -> Tensor:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from tpcd.belief.modes import climb
+from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.evidence import Fit, Question, carried, fit_stream
 from tpcd.effects.protocol import Effect
@@ -36,11 +37,27 @@ class Glance:
     """Standard deviation there of each parameter of the effect, in SI units."""
 
 
+@dataclass(frozen=True)
+class _Peak:
+    """The numbers of a glance."""
+
+    log_evidence: float
+    sd: tuple[float, ...]
+
+
 def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
     """Climb to the modes of the base model's effects and one more; `fresh` points set out from
     all over the prior."""
     effects = (*base.effects, effect)
+    names = tuple(e.name for e in effects)
     prior = question.scene.with_effects(effects)
+    key = (question.fingerprint, names, prior.low, prior.high, base.fingerprint, fresh)
+    found = question.memory.recall(key, _Peak, lambda: _peak(question, base, prior, fresh))
+    return Glance(effect, found.log_evidence, found.sd)
+
+
+def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _Peak:
+    effects = prior.effects
     target = ContactTarget(prior, question.misfit, base.step, question.history)
     generator = fit_stream(question, effects, 0)
     start = carried(base, prior, generator, PLACES)
@@ -56,6 +73,6 @@ def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
     top = int(each.argmax())
     covariance = torch.linalg.inv(information[top])
     vector, slope = prior.to_vector_with_slope(points[best[top]][:-1])
-    own = slice(len(vector) - len(effect.parameters), len(vector))
+    own = slice(len(vector) - len(effects[-1].parameters), len(vector))
     sd = covariance.diagonal()[:-1].sqrt() * slope
-    return Glance(effect, float(each[top]), tuple(sd[own].tolist()))
+    return _Peak(float(each[top]), tuple(sd[own].tolist()))

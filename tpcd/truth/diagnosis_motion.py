@@ -22,7 +22,7 @@ from tpcd.truth.motions import (
     ScriptedMotion,
 )
 
-LOADS = LIGHT, MEDIUM, HARD = (1.5, 3.5, 6.0)
+LOADS = LIGHT, MEDIUM, HARD = (1.5, 3.5, 7.0)
 """Pressed at each spot [N]."""
 LEFT, RIGHT = DOWN, UP = (-1.0, 1.0)
 """Directions of slides."""
@@ -32,6 +32,8 @@ SLIDE, WALL_SLIDE = 0.025, 0.018
 """Distances of slides on the floor and on the wall [m]."""
 CLEARANCE = 0.035
 """Height of free moves, and of the hand on the wall, over the floor [m]."""
+HELD, NUDGES = 0.85, (1.1, 1.25)
+"""Pushes along a surface relative to what kinetic friction holds: less, and what static could."""
 PEEL = 0.005
 """Height at which it is tried whether a surface lets go [m]: 0.5 N at 100 N/m."""
 TILT = 0.12
@@ -56,16 +58,17 @@ def _script(history: History, generator: torch.Generator) -> Script:
     for visit in (
         [corner(MEDIUM, MEDIUM), climb(MEDIUM), wall_slide(DOWN, MEDIUM)],
         _free_visit(PLACES[1], side),
-        [above(PLACES[1]), *_press_at_loads(press), lean(RIGHT, HARD), nudge(RIGHT, HARD)],
-        [tilt(side), tilt(-side, HARD), slide(LEFT, HARD), slide(RIGHT, HARD), pause, peel],
+        [above(PLACES[1]), *_press_at_loads(press), *_pushes(HARD)],
+        [tilt(side, LIGHT), tilt(side, HARD), tilt(-side, HARD), tilt(-side, LIGHT)],
+        [slide(LEFT, HARD), slide(RIGHT, HARD), pause, peel],
         [facing_wall, *_press_at_loads(wall_press)],
         [wall_slide(UP, HARD), wall_slide(DOWN, HARD), pause],
         [wall_slide(UP, LIGHT), wall_slide(DOWN, LIGHT), wall_tilt(side), wall_tilt(-side)],
-        [wall_peel, above(PLACES[0]), press(MEDIUM), lean(LEFT, MEDIUM), nudge(LEFT, MEDIUM)],
+        [wall_peel, above(PLACES[0]), press(HARD), *(nudge(LEFT, HARD, n) for n in NUDGES)],
         [slide(LEFT, LIGHT), slide(RIGHT, LIGHT), above(PLACES[2]), press(MEDIUM)],
         [corner(MEDIUM, MEDIUM), corner(MEDIUM, HARD, side)],
-        [*_free_visit(PLACES[0], -side), press(MEDIUM), peel],
         [above(PLACES[2]), press(LIGHT), slide(LEFT, MEDIUM), slide(RIGHT, MEDIUM)],
+        [*_free_visit(PLACES[0], -side), press(MEDIUM), peel],
     ):
         history = yield from _follow(history, visit)
     while True:
@@ -107,6 +110,12 @@ def _free_visit(place: float, side: float) -> list[Move]:
     return [above(place), at(0.02 * side, 0.02, TILT), at(-0.015 * side, 0.0, -TILT), pause]
 
 
+def _pushes(load: float) -> list[Move]:
+    """Push to and fro without sliding, and then with more and more."""
+    leans = [lean(way, load) for way in (RIGHT, LEFT, RIGHT)]
+    return [*leans, *(nudge(RIGHT, load, excess) for excess in NUDGES)]
+
+
 def _press_at_loads(kind: Callable[[float], Move]) -> list[Move]:
     return [kind(load) for load in LOADS]
 
@@ -140,17 +149,17 @@ def lean(direction: float, load: float) -> Move:
     """Along the floor with less than friction holds, which only moves what yields."""
 
     def move(felt: Feel) -> Command:
-        reach = 0.7 * felt.floor_friction * load / felt.stiffness[0]
+        reach = HELD * felt.floor_friction * load / felt.stiffness[0]
         return felt.x + direction * reach, _down(felt, load), 0.0
 
     return move
 
 
-def nudge(direction: float, load: float) -> Move:
-    """Along the floor with a little more than kinetic friction, which static could hold."""
+def nudge(direction: float, load: float, excess: float) -> Move:
+    """Along the floor with `excess` times what kinetic friction holds, which static could."""
 
     def move(felt: Feel) -> Command:
-        reach = 1.15 * felt.floor_friction * load / felt.stiffness[0]
+        reach = excess * felt.floor_friction * load / felt.stiffness[0]
         return felt.x + direction * reach, _down(felt, load), 0.0
 
     return move

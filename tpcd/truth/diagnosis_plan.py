@@ -18,11 +18,10 @@ from tpcd.truth.contact_feel import USUAL_FRICTION, Command, Feel
 from tpcd.truth.diagnosis_motion import (
     CLEARANCE,
     DOWN,
-    HARD,
     LEFT,
     LIGHT,
-    LOADS,
     MEDIUM,
+    NUDGES,
     PLACES,
     RIGHT,
     TILT,
@@ -46,6 +45,8 @@ from tpcd.truth.motions import FORCE_LIMIT
 
 LEAST_REACH = 1e-3
 """A plan that could move by no more than this at a time is refused [m]."""
+HARD = 6.0
+"""Largest load that is foreseen [N]: what is felt on the way may be more by the stated error."""
 _HELD = 0.35
 """Share of friction that should hold even where friction is much less than usual."""
 _REACHED = 1e-6
@@ -168,15 +169,21 @@ def _visits(side: float) -> list[list[Step]]:
         [_press(MEDIUM), _slide(LEFT, MEDIUM), _slide(RIGHT, MEDIUM), _tilt(side)],
         [_facing(), _wall_press(MEDIUM), _wall_slide(UP, MEDIUM), _wall_slide(DOWN, MEDIUM)],
         _free(middle, side),
-        [_over(middle), *(_press(load) for load in LOADS), _hold(RIGHT), _hold(LEFT)],
-        [_nudge(RIGHT, HARD)],
-        [_tilt(side), _tilt(-side, HARD), _slide(LEFT, HARD), _slide(RIGHT, HARD), _pause()],
+        [
+            _over(middle),
+            *(_press(load) for load in (LIGHT, MEDIUM, HARD)),
+            _hold(RIGHT),
+            _hold(LEFT),
+        ],
+        [_nudge(RIGHT, HARD, excess) for excess in NUDGES],
+        [_tilt(side, LIGHT), _tilt(side, HARD), _tilt(-side, HARD), _tilt(-side, LIGHT)],
+        [_slide(LEFT, HARD), _slide(RIGHT, HARD), _pause()],
         [("peel off the floor by a little", peel)],
-        [_facing(0.03), *(_wall_press(load) for load in LOADS)],
+        [_facing(0.03), *(_wall_press(load) for load in (LIGHT, MEDIUM, HARD))],
         [_wall_slide(UP, HARD), _wall_slide(DOWN, HARD), _pause()],
         [_wall_slide(UP, LIGHT), _wall_slide(DOWN, LIGHT), _wall_tilt(side), _wall_tilt(-side)],
         [("peel off the wall by a little", wall_peel)],
-        [_over(left), _press(MEDIUM), _nudge(LEFT, MEDIUM)],
+        [_over(left), _press(HARD), *(_nudge(LEFT, HARD, excess) for excess in NUDGES)],
         [_slide(LEFT, LIGHT), _slide(RIGHT, LIGHT), _over(right), _press(MEDIUM)],
         [_corner(MEDIUM, MEDIUM), _corner(MEDIUM, HARD, side)],
         [*_free(left, -side), _press(MEDIUM), ("peel off the floor by a little", peel)],
@@ -200,9 +207,10 @@ def _slide(direction: float, load: float) -> Step:
     return f"slide {'right' if direction > 0 else 'left'} at {load:g} N", slide(direction, load)
 
 
-def _nudge(direction: float, load: float) -> Step:
+def _nudge(direction: float, load: float, excess: float) -> Step:
     way = "right" if direction > 0 else "left"
-    return f"push {way} at {load:g} N, barely enough to slide", nudge(direction, load)
+    purpose = f"push {way} at {load:g} N with {excess:g} times what should make it slide"
+    return purpose, nudge(direction, load, excess)
 
 
 def _hold(direction: float) -> Step:

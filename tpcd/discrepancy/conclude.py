@@ -1,0 +1,126 @@
+"""From what the search found to a verdict in plain values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tpcd.belief.belief import Belief
+from tpcd.data.episode import Episode
+from tpcd.discrepancy.adequacy import Adequacy
+from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
+from tpcd.discrepancy.evidence import Fit, posterior
+from tpcd.discrepancy.formula import FORMULAS
+from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors
+from tpcd.discrepancy.naming import Workbench
+from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
+from tpcd.discrepancy.variants import NUMERICS, Variant
+from tpcd.random import stream
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the rounds arrived at."""
+
+    base: Fit
+    final: Fit
+    before: Adequacy
+    """What the model as it was given leaves."""
+    after: Adequacy
+    close: tuple[Alternative, ...] = ()
+    variants: tuple[Variant, ...] = ()
+    """Other base models that were taken instead."""
+
+
+def conclude(
+    bench: Workbench, found: Findings, episodes: Sequence[Episode], fresh: Sequence[Episode]
+) -> Diagnosis:
+    """The verdict, its effects, and the gap before and after."""
+    settings, question = bench.settings, bench.question
+    belief, first = (posterior(question, fit) for fit in (found.final, found.base))
+    effects = (
+        *(NamedEffect("numerics", (), v.note) for v in found.variants if v.name in NUMERICS),
+        *named_effects(belief, bench.given),
+    )
+    verdict, sentence = _verdict(bench, found, effects)
+    gap: tuple[Gap, ...] = ()
+    share = math.nan
+    if found.final is not found.base:
+        gap, share = _gap(bench, found, episodes, fresh)
+    shape = _shape_line(belief, found.variants)
+    bench.tell(f"shape: {shape}")
+    bench.tell(f"verdict: {verdict.replace('_', ' ')}: {sentence}")
+    return Diagnosis(
+        verdict=verdict,
+        sentence=sentence,
+        effects=effects,
+        alternatives=found.close if effects else (),
+        candidates=tuple(bench.candidates),
+        log_evidence_base=found.base.log_evidence,
+        log_evidence=found.final.log_evidence,
+        gap=gap,
+        share_closed=share,
+        held_out="fresh episodes" if fresh else "blocks held out",
+        cells_before=found.before.cells,
+        cells_after=found.after.cells,
+        unexplained_before=found.before.unexplained,
+        unexplained_after=found.after.unexplained,
+        theta_before=theta_estimates(first),
+        theta_after=theta_estimates(belief),
+        shape=shape,
+        detection_limits=detection_limits(
+            bench.glances, settings.catalogue, bench.coverage, settings.least_gain
+        ),
+        coverage=dict(bench.coverage.counts),
+        notes=tuple(bench.notes),
+        belief=belief,
+        belief_before=first,
+    )
+
+
+def _verdict(
+    bench: Workbench, found: Findings, effects: Sequence[NamedEffect]
+) -> tuple[Verdict, str]:
+    told = " and ".join(effect.sentence for effect in effects)
+    after, level = found.after, bench.settings.level
+    if bench.settings.adequacy and not after.adequate(level):
+        cell = after.cells[0]
+        where = f"{after.unexplained:.0%} of the transitions are not explained"
+        if after.cells_p <= level:
+            where += f"; most of it in {cell.channel} ({cell.covariate}) while {cell.mode}"
+        besides = f"; besides, {told}" if told else ""
+        return "unknown_remains", f"something else is missing: {where}{besides}"
+    if not effects:
+        return "nothing_missing", "the model explains the data; nothing is missing"
+    formulas = {formula.name for formula in FORMULAS}
+    if any(effect.name in formulas for effect in effects):
+        return "formula", told
+    if found.close:
+        others = " or ".join(" + ".join(a.names) for a in found.close)
+        return "ambiguous", f"{told}; {others} would explain the data as well"
+    return "named", told
+
+
+def _gap(
+    bench: Workbench, found: Findings, episodes: Sequence[Episode], fresh: Sequence[Episode]
+) -> tuple[tuple[Gap, ...], float]:
+    models = (found.base, found.final)
+    if fresh:
+        errors = [prediction_errors(bench.question, fit, fresh) for fit in models]
+    else:
+        errors = [held_out_errors(bench.question, fit, episodes) for fit in models]
+    gap, share = gaps(*errors, stream(bench.settings.seed, 79))
+    return tuple(gap), share
+
+
+def _shape_line(belief: Belief, variants: Sequence[Variant]) -> str:
+    """What the data say of the outline beyond the shape prior, which is no effect."""
+    sd = float(belief.weights @ belief.misfit_sd)
+    text = f"the outline differs from those of the prior by about {1e3 * sd:.1f} mm"
+    for variant in variants:
+        if variant.name not in NUMERICS:
+            place = belief.prior.names.index("scale")
+            scale = f"scale {float(belief.mean()[place]):.2f}"
+            text = f"{variant.note}: explained with {scale}, and {text}"
+    return text

@@ -1,0 +1,208 @@
+"""One round of naming: every candidate effect beside the model so far, the best of them judged.
+
+Every candidate is fitted jointly with theta from the prior, with the same budget as the model
+without it; that model is fitted again from where the best alternatives arrived, since a badly
+fitted base is the main cause of false names. Evidence ranks, and blocks held out may veto.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
+from tpcd.discrepancy.coverage import MOTIONS, Coverage
+from tpcd.discrepancy.diagnosis import Alternative, Candidate
+from tpcd.discrepancy.evidence import Fit, Question, fit_model, joined_fit
+from tpcd.discrepancy.heldout import held_out_scores, lower_bound
+from tpcd.discrepancy.screening import Glance, glance
+from tpcd.discrepancy.settings import (
+    AMBIGUOUS,
+    FRESH,
+    SURE,
+    VETO_LEVEL,
+    WITHIN,
+    WORTH_FITTING,
+    DiagnosisSettings,
+)
+from tpcd.discrepancy.variants import VARIANTS, Variant
+from tpcd.effects.protocol import Effect
+from tpcd.random import stream
+
+Result = TypeVar("Result")
+
+
+@dataclass
+class Workbench:
+    """What a diagnosis works on, and what it has noted so far."""
+
+    question: Question
+    settings: DiagnosisSettings
+    coverage: Coverage
+    given: int
+    """Effects that are part of the model to begin with."""
+    tell: Callable[[str], None]
+    candidates: list[Candidate] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    glances: list[Glance] = field(default_factory=list)
+    """Of the first round."""
+
+    def warn(self, line: str) -> None:
+        """Note something, and say it at once."""
+        self.notes.append(" ".join(line.split()))
+        self.tell(f"warning: {self.notes[-1]}")
+
+    def adequacy(self, fit: Fit) -> Adequacy:
+        """What a model leaves."""
+        return check_adequacy(self.question, fit, stream(self.settings.seed, 78))
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one round arrived at."""
+
+    base: Fit
+    """The model before, perhaps better fitted."""
+    best: Fit | None = None
+    """The model with one more effect, where one is accepted."""
+    close: tuple[Alternative, ...] = ()
+    """What explains the data about as well."""
+
+
+def fit_well(bench: Workbench, effects: Sequence[Effect], start: Sequence[Fit] = ()) -> Fit:
+    """A model on two seeds, and on a third where they do not agree."""
+    fit = fit_model(bench.question, effects, (0, 1), start=start)
+    if fit.spread > 2.0:
+        fit = joined_fit(fit, fit_model(bench.question, effects, (2,), start=(*start, fit)))
+    return fit
+
+
+def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: bool) -> Round:
+    """Try one more effect of the pool; `adequate` says whether the model so far explains all."""
+    settings, question = bench.settings, bench.question
+    number = len(current.effects) - bench.given + 1
+    glances = _glances(bench, current, pool, number, adequate)
+    if number == 1 and not bench.glances:
+        bench.glances.extend(glances)
+    worth = current.log_evidence + WORTH_FITTING[adequate]
+    chosen = [g.effect for g in glances[: settings.full_fits] if g.log_evidence > worth]
+
+    def fitted(effect: Effect, seed: int) -> Fit:
+        return fit_model(question, (*current.effects, effect), (seed,), start=(current,))
+
+    fits = _each(bench, chosen, number, lambda effect: fitted(effect, 0))
+    top = max((fit.log_evidence for fit in fits), default=-math.inf)
+    near = [
+        joined_fit(fit, fitted(fit.effects[-1], 1))
+        if fit.log_evidence > current.log_evidence
+        else fit
+        for fit in fits
+        if fit.log_evidence > top - WITHIN
+    ]
+    near.sort(key=lambda fit: -fit.log_evidence)
+    if settings.base_refit and near:
+        again = fit_model(question, current.effects, (10,), start=(current, *near[:2]))
+        current = joined_fit(current, again)
+    for g in glances:
+        full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)
+        gain = (g if full is None else full).log_evidence - current.log_evidence
+        by_seed = () if full is None else full.by_seed
+        bench.candidates.append(Candidate(g.effect.name, number, gain, by_seed))
+    if not near:
+        return Round(current)
+    return _judged(bench, current, near, number)
+
+
+def better_base(bench: Workbench, current: Fit, rival: float) -> tuple[Variant, Question] | None:
+    """The variant of the base model that explains the data best, if it does so better than the
+    model as it is and the `rival` log evidence of the best candidate."""
+    found: list[tuple[float, Variant, Question]] = []
+    for variant in VARIANTS:
+        question = variant.change(bench.question)
+        try:
+            fit = fit_model(question, current.effects, (0,), start=(current,))
+        except Exception as error:  # one failure must not cost the others
+            bench.warn(f"{variant.name} failed: {type(error).__name__}: {error}")
+            continue
+        gain = fit.log_evidence - current.log_evidence
+        bench.candidates.append(Candidate(variant.name, 0, gain, fit.by_seed))
+        found.append((fit.log_evidence, variant, question))
+    evidence, variant, question = max(found, key=lambda one: one[0], default=(-math.inf,) * 3)
+    least = max(current.log_evidence, rival) + bench.settings.least_gain
+    if evidence < least:
+        return None
+    return variant, question
+
+
+def pruned(bench: Workbench, fit: Fit) -> Fit:
+    """The model without earlier effects that it no longer needs."""
+    own = fit.effects[bench.given :]
+    for effect in own[:-1]:
+        less = tuple(e for e in fit.effects if e is not effect)
+        other = fit_model(bench.question, less, (0, 1), start=(fit,))
+        if fit.log_evidence - other.log_evidence < bench.settings.least_gain:
+            bench.tell(f"{effect.name} is no longer needed")
+            fit = other
+    return fit
+
+
+def _glances(
+    bench: Workbench, current: Fit, pool: Sequence[Effect], number: int, adequate: bool
+) -> list[Glance]:
+    """A quick look at every effect that the data excite, the best first."""
+    candidates = [effect for effect in pool if effect.name not in current.names]
+    excited = [e for e in candidates if not bench.coverage.missing(e.needs)]
+    for effect in candidates:
+        if effect not in excited:
+            lacks = ", ".join(bench.coverage.missing(effect.needs))
+            outcome = f"not excited: {lacks}"
+            bench.candidates.append(Candidate(effect.name, number, math.nan, (), outcome))
+    fresh = FRESH[adequate] if bench.settings.from_prior else 0
+    glances = _each(bench, excited, number, lambda e: glance(bench.question, current, e, fresh))
+    return sorted(glances, key=lambda g: -g.log_evidence)
+
+
+def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:
+    """Whether the best of the candidates is accepted, and what comes close to it."""
+    best = near[0]
+    gain = best.log_evidence - current.log_evidence
+    accepted = gain >= bench.settings.least_gain and min(best.by_seed) > current.log_evidence
+    reason = f"gain {gain:.1f}"
+    if accepted and gain < SURE:
+        own, base = (held_out_scores(bench.question, fit) for fit in (best, current))
+        generator = stream(bench.settings.seed, 77, number)
+        bound = lower_bound(own - base, generator, VETO_LEVEL)
+        reason += f", held-out gain at least {bound:+.2f} a transition"
+        accepted = bound > 0
+    outcome = f"{'accepted' if accepted else 'rejected'}: {reason}"
+    place = (best.names[-1], number)
+    bench.candidates[:] = [
+        replace(c, outcome=outcome) if (c.name, c.round) == place else c for c in bench.candidates
+    ]
+    bench.tell(f"round {number}: {best.names[-1]} {outcome}")
+    close = tuple(
+        Alternative(
+            fit.names,
+            fit.log_evidence - current.log_evidence,
+            "; or ".join(MOTIONS.get(need, need) for need in fit.effects[-1].needs),
+        )
+        for fit in near[1:]
+        if fit.log_evidence > best.log_evidence - AMBIGUOUS
+    )
+    return Round(current, best if accepted else None, close)
+
+
+def _each(
+    bench: Workbench, effects: Sequence[Effect], number: int, work: Callable[[Effect], Result]
+) -> list[Result]:
+    """Do something with every candidate; one that fails costs no other."""
+    done = []
+    for effect in effects:
+        try:
+            done.append(work(effect))
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            bench.warn(f"{effect.name} failed in round {number}: {reason}")
+    return done

@@ -1,0 +1,57 @@
+"""Choices and thresholds of the gap workflow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from tpcd.belief.cloud import SamplerSettings
+from tpcd.discrepancy.evidence import FIT_SAMPLER
+from tpcd.effects import CATALOGUE
+from tpcd.effects.protocol import Effect
+from tpcd.simulator import StepSettings
+
+FEWEST_ROWS = 10
+"""Transitions below which nothing is named."""
+FRESH = {True: 8, False: 40}
+"""Points of a quick look that set out from all over the prior, where the model explains the data
+and where it does not."""
+WORTH_FITTING = {True: -2.0, False: -25.0}
+"""Gain of the quick look from which a candidate gets a full fit at all: where the model explains
+the data as it is, and where it does not."""
+WITHIN = 15.0
+"""Candidates whose gain is so close to the best get a second seed."""
+AMBIGUOUS = 3.0
+SURE = 25.0
+"""Gain from which blocks held out have no veto: their fits to fewer data are less sure than it."""
+VETO_LEVEL = 0.2
+"""Of the bound of the held-out gain. What shows in one stretch of the data alone, such as a push
+that static friction holds, is missed by the bootstrap in a third of its draws, so that a bound
+at 5 % would never let it pass."""
+FINAL_SEEDS = (20, 21)
+"""Further seeds of the model that was found."""
+
+
+@dataclass(frozen=True)
+class DiagnosisSettings:
+    """Choices of the workflow."""
+
+    seed: int = 0
+    base_refit: bool = True
+    """Fit the base model again from where the alternatives arrived."""
+    from_prior: bool = True
+    """Search for modes from all over the prior; else only from where the base model arrived."""
+    adequacy: bool = True
+    """Test whether the final model explains the data."""
+    parity: bool = True
+    """Let what pose and wrench say about each other count."""
+    most_effects: int = 3
+    full_fits: int = 4
+    """Candidates of a round that are fitted in full."""
+    least_gain: float = 6.0
+    """Gain of log evidence at which an effect is accepted: 3 and the logarithm of the number of
+    candidates, each of which has a share of the prior odds."""
+    level: float = 0.001
+    """Level of the test that says whether something is left."""
+    step: StepSettings = field(default_factory=StepSettings)
+    sampler: SamplerSettings = FIT_SAMPLER
+    catalogue: tuple[Effect, ...] = CATALOGUE

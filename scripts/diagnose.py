@@ -26,6 +26,8 @@ class Diagnose:
     """Episodes of the same set-up that only measure the gap; without them blocks are held out."""
     seed: int = 0
     """Seed of all random numbers."""
+    resume: bool = False
+    """Go on with a run in the folder that was stopped."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     compare: tuple[Path, ...] = ()
@@ -35,6 +37,8 @@ class Diagnose:
         check_numbers(self)
         if bool(self.episodes) == bool(self.compare):
             raise ValueError("give episodes to diagnose, or runs to --compare")
+        if self.resume and self.overwrite:
+            raise ValueError("give --resume or --overwrite, not both")
 
 
 def diagnose_episodes(config: Diagnose) -> int:
@@ -50,11 +54,18 @@ def diagnose_episodes(config: Diagnose) -> int:
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
-    from tpcd.commands.diagnosing import EXIT_CODES, compare_runs, write_diagnosis
+    from tpcd.commands.diagnosing import (
+        EXIT_CODES,
+        compare_runs,
+        fits_of,
+        forget_fits,
+        open_diagnosis,
+        write_diagnosis,
+    )
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.model import Model, load_effects, load_model
-    from tpcd.results import format_table, run_folder, write_results
+    from tpcd.results import format_table, write_results
     from tpcd.shape.checkpoint import load_prior
 
     if config.compare:
@@ -71,12 +82,16 @@ def diagnose_episodes(config: Diagnose) -> int:
     own = [effect for path in config.candidates for effect in load_effects(path)]
     settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
     settings = replace(settings, catalogue=(*settings.catalogue, *own))
-    with run_folder(config.out, "scripts/diagnose.py", config, config.overwrite) as folder:
+    with open_diagnosis(config, config.out, config.overwrite, config.resume) as folder:
         if data.answer is not None:
             found = data.answer
             _tell(f"verdict: not enough information: {found.sentence}")
         else:
-            found = diagnose(data.episodes, shape, settings, data.fresh, model.effects, tell=_tell)
+            files = (*config.candidates, *(() if config.model is None else (config.model,)))
+            memory = fits_of(folder, files)
+            found = diagnose(
+                data.episodes, shape, settings, data.fresh, model.effects, _tell, memory
+            )
         found = replace(found, notes=(*data.notes, *found.notes))
         rows = [
             {
@@ -93,6 +108,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         with SummaryWriter(folder / "tensorboard") as writer:
             write_diagnosis(found, data.episodes, settings.least_gain, config.prior, folder, writer)
         write_results(folder, rows, seeds=[config.seed])
+        forget_fits(folder)
     print(f"\nreport in {config.out}/report.html, verdict in {config.out}/verdict.json", end="")
     if found.effects:
         print(

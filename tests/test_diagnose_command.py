@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from tpcd.discrepancy.diagnosis import (
     Limit,
     NamedEffect,
 )
+from tpcd.discrepancy.memory import Memory
 
 
 def a_diagnosis() -> Diagnosis:
@@ -82,6 +84,34 @@ def test_bad_input_is_one_line(world: Path, capsys: pytest.CaptureFixture[str]) 
         error = capsys.readouterr().err.strip()
         assert expected in error and "\n" not in error
     assert not (world / "bad").exists()
+
+
+def test_a_stopped_run_keeps_its_fits_and_goes_on(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Memory] = []
+
+    def stopped(*arguments: object) -> Diagnosis:
+        memory = arguments[-1]
+        assert isinstance(memory, Memory) and memory.folder is not None
+        told.append(memory)
+        if len(told) == 1:
+            memory.recall(("one",), Candidate, lambda: Candidate("a", 1, 2.0))
+            raise KeyboardInterrupt
+        assert memory.recall(("one",), Candidate, lambda: Candidate("b", 1, 2.0)).name == "a"
+        return replace(a_diagnosis(), gap=())
+
+    monkeypatch.setattr("tpcd.discrepancy.search.diagnose", stopped)
+    out = tmp_path / "run"
+    words = (str(world / "a.csv"), "--prior", PRIOR, "--out", str(out))
+    assert call("diagnose", *words) == 130
+    assert "goes on with --resume" in capsys.readouterr().err
+    assert call("diagnose", *words, "--resume", "--seed", "5") == 2
+    assert "another seed" in capsys.readouterr().err
+    assert call("diagnose", *words, "--resume") == 10
+    assert told[0].salt == told[1].salt and not (out / "fits").exists()
+    assert call("diagnose", *words, "--resume") == 2
+    assert "has its verdict" in capsys.readouterr().err
 
 
 def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:

@@ -55,8 +55,8 @@ def run_folder(
     """A run folder as `open_run` makes it that stays only if the work in it is done.
 
     Where the body raises or is interrupted, what it wrote is removed and an earlier run
-    that it was to replace is put back. `resumable` names the file with which a stopped run
-    can go on (`continue_run`): once it is there, the run stays.
+    that it was to replace is put back. `resumable` names the file or folder with which a stopped
+    run can go on (`continue_run`): once it is there, the run stays.
     """
     folder = Path(path).absolute()
     aside = folder.with_name(f".{folder.name}.{os.getpid()}.earlier")
@@ -68,7 +68,7 @@ def run_folder(
     try:
         yield _started(Path(path), command, config)
     except BaseException as error:
-        if resumable and (folder / resumable).is_file():
+        if resumable and (folder / resumable).exists():
             shutil.rmtree(aside, ignore_errors=True)
             if isinstance(error, KeyboardInterrupt):
                 raise KeyboardInterrupt(f"{path} goes on with --resume") from error

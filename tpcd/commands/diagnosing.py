@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import math
+import shutil
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,14 @@ from matplotlib.figure import Figure
 from tpcd.belief.storage import save_belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Cell, Diagnosis
+from tpcd.discrepancy.memory import Memory, digest
 from tpcd.effects.model import Model, write_model
 from tpcd.errors import RunError
 from tpcd.figures.diagnosis import evidence_bars, gap_bars, residual_map, theta_shift, worst_stretch
 from tpcd.figures.sinks import save_figure
 from tpcd.predict import ContactPredictor
-from tpcd.results import read_json, write_json
+from tpcd.results import RESULTS_FILE, continue_run, read_json, run_folder, write_json
+from tpcd.versions import versions
 
 EXIT_CODES = {
     "nothing_missing": 0,
@@ -33,6 +37,33 @@ EXIT_CODES = {
 _TIMES = ("before", "after")
 STRETCH = 20
 """Rows of the worst stretch."""
+FITS_FOLDER = "fits"
+"""Where a run keeps its fits until it is done."""
+
+
+def open_diagnosis(
+    config: Any, folder: Path, overwrite: bool, resume: bool
+) -> AbstractContextManager[Path]:
+    """A new run folder, or with `resume` that of a run that was stopped. Raises `RunError`."""
+    if not resume:
+        return run_folder(folder, "scripts/diagnose.py", config, overwrite, resumable=FITS_FOLDER)
+    if (folder / RESULTS_FILE).is_file():
+        raise RunError(folder, "has its verdict", "leave out --resume")
+    return nullcontext(continue_run(folder, config, ("out", "resume", "overwrite")))
+
+
+def fits_of(folder: Path, code: Sequence[Path]) -> Memory:
+    """The fits of a run; those made by other code, that of the files
+    `code` included, do not count."""
+    own = versions()
+    texts = (path.read_text(encoding="utf-8") for path in code)
+    salt = digest(own["tpcd"], own["git"], *texts)
+    return Memory(folder / FITS_FOLDER, salt)
+
+
+def forget_fits(folder: Path) -> None:
+    """Remove the fits of a run that is done."""
+    shutil.rmtree(folder / FITS_FOLDER, ignore_errors=True)
 
 
 def write_diagnosis(

@@ -52,9 +52,9 @@ class LogImport:
     """Direction of the recording's world that is z, up."""
     origin: Triple = (0.0, 0.0, 0.0)
     """Point of the recording's world that becomes the origin [m]."""
-    tool_x: Triple | None = None
-    """Direction fixed to the end effector that points along x where the angle is 0; without it the
-    angle is 0 at the start."""
+    tool_x: tuple[float, ...] = ()
+    """Direction fixed to the end effector (three numbers) that points along x where the angle is 0;
+    without it the angle is 0 at the start."""
     wrench_frame: Literal["world", "tool"] = "world"
     """Axes in which forces and torques are given."""
     wrench_point: Triple = (0.0, 0.0, 0.0)
@@ -68,8 +68,9 @@ class LogImport:
     drift: tuple[float, float, float, float] = (3e-4, 1e-3, 0.5, 0.05)
     """Largest change of a settled arm within them: position [m], angle [rad], force [N], torque
     [N·m]."""
-    sensor_std: tuple[float, float, float, float, float, float] | None = None
-    """Noise of a row, where it is known better than from the still stretches."""
+    sensor_std: tuple[float, ...] = ()
+    """Noise of a row (x, z, phi, F_x, F_z, tau), where it is known better than from the still
+    stretches."""
     object: str | None = None
     """Name of the object, for the episode's YAML."""
     keep: tuple[str, ...] = ()
@@ -82,6 +83,10 @@ class LogImport:
     def __post_init__(self) -> None:
         check_numbers(self, above={"rate": 0.0, "window": 0.0, "stiffness": 0.0, "drift": 0.0},
                       least={"sensor_std": 0.0})  # fmt: skip
+        for name, count in (("tool_x", 3), ("sensor_std", 6)):
+            found = len(getattr(self, name))
+            if found not in (0, count):
+                raise ValueError(f"{name} has {found} numbers, expected {count}")
 
 
 def import_recording(config: LogImport) -> int:
@@ -101,13 +106,13 @@ def import_recording(config: LogImport) -> int:
 
     choices = Importing(
         stiffness=config.stiffness,
-        plane=Plane(config.plane_x, config.plane_z, config.origin, config.tool_x),
+        plane=Plane(config.plane_x, config.plane_z, config.origin, config.tool_x or None),
         wrench=WrenchReading(
             config.wrench_frame, -1.0 if config.invert_wrench else 1.0, config.wrench_point
         ),
         stillness=Stillness(config.window, config.drift),
         tare=config.tare,
-        sensor_std=config.sensor_std,
+        sensor_std=config.sensor_std or None,
         object=config.object,
     )
     log = _read(config)

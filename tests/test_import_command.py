@@ -95,6 +95,16 @@ def test_nothing_is_written_until_it_is_accepted(
         assert ("no episode written" in capsys.readouterr().out) == (code == 3)
 
 
+def test_what_is_known_better_is_taken(log: Path, tmp_path: Path) -> None:
+    std = ("1e-4", "1e-4", "3e-4", "0.2", "0.2", "0.01")
+    more = ("--sensor_std", *std, "--tool_x", "0", "0", "1", "--accept", "--tare")
+    assert importing(*words(log, tmp_path / "run", *more)) == 0
+    episode = read_episode(tmp_path / "run")
+    assert episode.sensor_std.tolist() == [float(value) for value in std]
+    # The tool's z axis points up, a quarter of a turn from x.
+    assert float(episode.poses[0, 2]) == pytest.approx(np.pi / 2, abs=0.01)
+
+
 def test_parts_of_a_recording_can_be_taken(log: Path, tmp_path: Path) -> None:
     assert importing(*words(log, tmp_path / "run", "--accept", "--end", "8")) == 0
     assert 2 <= len(read_episode(tmp_path / "run")) < len(EPISODE)
@@ -107,6 +117,7 @@ BAD = {
     "topics": (("LOG", "--topics", "pose=/a"), "topics are for bags"),
     "map": (("a.bag", "--map", "x=x"), "map is for tables"),
     "window": (("LOG", "--map", *MAP, "--window", "9"), "shorter than 9 s; lower --window"),
+    "tool": (("LOG", "--tool_x", "1"), "tool_x has 1 numbers, expected 3"),
     "negative": (("LOG", "--window", "-1"), "window is -1, expected more than 0"),
     "euler": (("LOG", "--map", "time=t", "x=p_0", "z=p_2", "F_x=w_0", "F_z=w_2", "T_y=w_4",
                "e1=p_3", "e2=p_4", "e3=p_5", "--euler", "XQ"), "Euler angles e1, e2, e3"),

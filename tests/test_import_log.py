@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 
 from tpcd.data.episode import Episode, read_episode, write_together
 from tpcd.data.measured import Measured, NoCommandsError, read_measured
-from tpcd.errors import EpisodeError
 from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import LogError
 from tpcd.logs.plane import Plane, WrenchReading, project
@@ -99,9 +98,8 @@ def test_wrong_stiffness_is_no_matter_of_signs() -> None:
 def test_the_zero_of_the_sensor_is_taken_where_it_is_asked_for() -> None:
     setting = replace(TURNED, zero=(3.0, -2.0, 5.0, 0.2, -0.1, 0.3))
     log = log_of(setting, SAMPLES)
-    biased = import_log(log, choices_of(setting))
-    with pytest.raises(EpisodeError, match="zero the sensor"):
-        biased.files(Path("e"))
+    with pytest.raises(LogError, match="at the free start, .*; subtract it with --tare"):
+        import_log(log, choices_of(setting))
     content = import_log(log, choices_of(setting, tare=True)).content
     assert isinstance(content, Episode)
     # Tool axes turn by little, so a zero that is constant in them is all but constant.

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from tpcd.data.checks import check_episode
+from tpcd.data.checks import FREE_WRENCH, NOISE_FACTOR, check_episode
 from tpcd.data.episode import Episode, episode_contents
 from tpcd.data.header import SENSOR_NAMES, Header
 from tpcd.data.measured import Measured, measured_contents
@@ -201,6 +201,15 @@ def _episode(
             f"the first settled step (at {extra['time_s'][0]:.3g} s) is pressed by K (x - u) ="
             f" ({pressed[0]:.2g}, {pressed[1]:.2g}) N, expected a free start",
             "begin with --start at a step without contact, and check --stiffness",
+        )
+    allowed = NOISE_FACTOR * np.array(header.sensor_std[3:]) + FREE_WRENCH
+    if (np.abs(rows[0, 3:]) > allowed).any():
+        read = ", ".join(f"{value:.2g}" for value in rows[0, 3:])
+        raise LogError(
+            log.path,
+            f"the sensor reads ({read}) N, N, N·m at the free start, expected 0 within"
+            f" {', '.join(f'{value:.2g}' for value in allowed)}",
+            "subtract it with --tare, or begin elsewhere with --start",
         )
     away = rows[0, :3] - commands[0]
     commands[0] = rows[0, :3]

@@ -30,7 +30,7 @@ class Plane:
     """Direction of the planar z axis, up."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point of the world that is the origin of the plane [m]."""
-    tool_x: tuple[float, float, float] | None = None
+    tool_x: tuple[float, ...] | None = None
     """Direction fixed to the end effector that lies along x where the angle is 0; without it the
     angle is 0 in the first sample."""
 

@@ -44,6 +44,8 @@ class Experiment(ExploringOptions):
     origin: tuple[float, ...] = ()
     """Origin of the task in the base frame [m], on the floor below the start; without it the TCP
     at the start, and then --floor is needed."""
+    tool_zero: tuple[float, ...] = ()
+    """Rotation vector of the tool in the base frame at angle zero [rad]; else as at the start."""
     floor: tuple[float, ...] = ()
     """Range in which the floor's height is [m]; else ±0.02."""
     wall: tuple[float, ...] = ()
@@ -64,6 +66,8 @@ class Experiment(ExploringOptions):
     """Upper corner [m, m, rad]."""
     rate: float = 125.0
     """Readings and targets each second [Hz]: 125, 250 or 500."""
+    stale_time: float = 0.04
+    """Without a new reading for this long the link is lost [s]; more only for an emulator."""
     settle_time: float = 60.0
     """Longest time to wait for a steady pose and force [s]."""
     yes: bool = False
@@ -79,6 +83,8 @@ class Experiment(ExploringOptions):
                 raise ValueError(f"{name} is {value}, expected two numbers, low < high")
         if self.origin and len(self.origin) != 3:
             raise ValueError(f"origin is {self.origin}, expected x y z in the base frame [m]")
+        if self.tool_zero and len(self.tool_zero) != 3:
+            raise ValueError(f"tool_zero is {self.tool_zero}, expected rx ry rz [rad]")
         if not self.origin and not self.floor:
             raise ValueError("neither origin nor floor is given; one of them must say where it is")
         if (self.policy == "file") != (self.commands is not None):
@@ -92,7 +98,10 @@ class Experiment(ExploringOptions):
             )
 
 
-MAY_CHANGE = ("robot", "yes", "settle_time", "surface_mm_per_10n", "stop_force", "payload", "rate")
+MAY_CHANGE = (
+    "robot", "yes", "settle_time", "stale_time", "surface_mm_per_10n", "stop_force", "payload",
+    "rate",
+)  # fmt: skip
 """Options, beside those of every exploration, with which a stopped run may go on."""
 
 
@@ -137,16 +146,22 @@ def _settings(config: Experiment) -> ArmSettings:
         config.surface_mm_per_10n,
         config.x_axis,
         config.z_axis,
-        (config.origin[0], config.origin[1], config.origin[2]) if config.origin else None,
+        _three(config.origin),
+        _three(config.tool_zero),
         config.payload,
         config.stop_force,
         config.workspace_low,
         config.workspace_high,
         config.rate,
+        config.stale_time,
         config.settle_time,
         priors={name: (value[0], value[1]) for name, value in given.items() if value},
         notes=f"explored with the arm at {config.robot}, policy {config.policy}",
     )
+
+
+def _three(values: tuple[float, ...]) -> tuple[float, float, float] | None:
+    return (values[0], values[1], values[2]) if values else None
 
 
 def _policy(

@@ -38,7 +38,7 @@ def arm_on(emulator: EmulatorSettings, folder: Path, **changed: Any) -> Universa
     """An arm that knows the emulator's surface and origin, with its workspace confirmed."""
     settings: dict[str, Any] = {
         "address": emulator.address, "origin": emulator.origin, "still_time": 1.5,
-        "surface_mm_per_10n": SURFACE, "payload": emulator.payload,
+        "stale_time": 1.0, "surface_mm_per_10n": SURFACE, "payload": emulator.payload,
     }  # fmt: skip
     return UniversalRobot(ArmSettings(**{**settings, **changed}), folder, lambda _: True)
 

@@ -204,6 +204,8 @@ def test_a_stopped_run_goes_on_and_a_slipped_object_does_not(emulator, tmp_path:
 def press_until_it_fails(arm: UniversalRobot) -> tuple[str, float]:
     """Start, and press and let go until an error; its text, and when it came."""
     x, z, _ = arm.start().poses[0].tolist()
+    assert arm._link is not None
+    arm._link.stale_time = 0.04
     with pytest.raises(RobotError) as caught:
         for _ in range(20):
             arm.settle(command(x, z - 0.05))
@@ -304,7 +306,7 @@ def test_the_whole_experiment_of_fifteen_moves(
     emulator = emulator_settings(surface_mm_per_10n=2.0)
     arguments = (
         "--robot", emulator.address, "--origin", *map(str, emulator.origin), "--yes",
-        "--surface_mm_per_10n", "2", "--payload", str(emulator.payload),
+        "--surface_mm_per_10n", "2", "--stale_time", "1", "--payload", str(emulator.payload),
         "--prior", PRIOR, "--policy", "random", "--out", str(out),
     )  # fmt: skip
     with running_emulator(emulator):
@@ -329,7 +331,8 @@ def test_a_fault_in_the_command_is_one_line_and_goes_on_with_resume(
     failing = emulator_settings(fault="protective_stop", fault_after=14.0)
     arguments = (
         "--origin", *map(str, failing.origin), "--yes", "--surface_mm_per_10n", str(SURFACE),
-        "--prior", PRIOR, "--policy", "random", "--out", str(out), "--steps", "4",
+        "--stale_time", "1", "--prior", PRIOR, "--policy", "random", "--out", str(out),
+        "--steps", "4",
     )  # fmt: skip
     with running_emulator(failing):
         assert robot_command("--robot", failing.address, *arguments) == 2

@@ -26,6 +26,8 @@ class ArmSettings:
     """Axis that is z of the task, away from the floor."""
     origin: tuple[float, float, float] | None = None
     """Origin of the task in the base frame [m]; None: the TCP at the start."""
+    tool_zero: tuple[float, float, float] | None = None
+    """Rotation vector of the tool in the base frame at angle zero [rad]; None: as at the start."""
     payload: float | None = None
     """Mass of gripper and object [kg], compared with what the controller was told; None: not."""
     stop_force: float = 20.0
@@ -36,6 +38,9 @@ class ArmSettings:
     """Upper corner [m, m, rad]."""
     rate: float = 125.0
     """Readings and targets each second [Hz]: 125, 250 or 500."""
+    stale_time: float = 0.04
+    """Without a new reading for this long the link is lost [s]; more only for an emulator on a busy
+    machine."""
     settle_time: float = 60.0
     """Longest time to wait for a steady pose and force [s]."""
     still_time: float = 3.0
@@ -53,7 +58,14 @@ class ArmSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings with which no arm should move."""
-        positive = ("surface_mm_per_10n", "stop_force", "settle_time", "still_time", "retreat")
+        positive = (
+            "surface_mm_per_10n",
+            "stop_force",
+            "settle_time",
+            "stale_time",
+            "still_time",
+            "retreat",
+        )
         for name in positive:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+LARGEST_LEAN = 0.03
+"""Out of the plane, of a tool that starts [rad]."""
 AXIS = re.compile(r"([+-]?)(?:(base|tool)_)?([xyz])")
 
 
@@ -43,14 +45,17 @@ def task_frame(
     x_axis: str = "+x",
     z_axis: str = "+z",
     origin: tuple[float, float, float] | None = None,
+    tool_zero: tuple[float, float, float] | None = None,
 ) -> TaskFrame:
-    """The frame of an arm whose TCP stands in the plane at phi = 0.
+    """The frame of an arm whose TCP stands in the plane.
 
     Axes are named `x`, `-y`, `base_z` for the base's, `tool_x`, `-tool_z` for the tool's. Without
-    `origin` [m] in the base frame the world begins at the TCP. Raises ValueError for other names,
-    and for axes that are not at right angles.
+    `origin` [m] in the base frame the world begins at the TCP; without `tool_zero`, a rotation
+    vector [rad], phi is zero as the tool stands. Raises ValueError for other names, for axes that
+    are not at right angles, and for a tool that leans out of the plane.
     """
-    turn = Rotation.from_rotvec(tcp[3:])
+    reference = tcp[3:].astype(float) if tool_zero is None else np.array(tool_zero, dtype=float)
+    turn = Rotation.from_rotvec(reference)
     x, z = _axis("x_axis", x_axis, turn), _axis("z_axis", z_axis, turn)
     if abs(float(x @ z)) > 1e-3:
         angle = np.degrees(np.arccos(np.clip(x @ z, -1, 1)))
@@ -64,7 +69,14 @@ def task_frame(
     normal = np.cross(x, z)
     # The plane goes through the TCP, wherever the origin was measured.
     place = place + (tcp[:3] - place) @ normal * normal
-    return TaskFrame(x, z, place, tcp[3:].astype(float))
+    frame = TaskFrame(x, z, place, reference)
+    _, lean = out_of_plane(frame, tcp)
+    if lean > LARGEST_LEAN:
+        raise ValueError(
+            f"the tool leans {lean:.3f} rad out of the plane of {x_axis} and {z_axis}, expected at"
+            f" most {LARGEST_LEAN:g} rad; turn it upright, or give its present angle as zero"
+        )
+    return frame
 
 
 def planar_pose(frame: TaskFrame, tcp: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " 3"]:

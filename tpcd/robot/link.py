@@ -28,8 +28,6 @@ VARIABLES = [
     "safety_status_bits",
     "payload",
 ]
-STALE = 0.04
-"""Without a new stamp for this long the link counts as lost [s]."""
 SAFETY_STOPS = {
     2: "protective stop",
     4: "safeguard stop",
@@ -64,14 +62,17 @@ class Sample:
 class Link:
     """A connected arm under remote control, its script uploaded and running."""
 
-    def __init__(self, address: str, rate: float) -> None:
-        """Connect; raises RobotError where that fails, SolverError without ur_rtde."""
+    def __init__(self, address: str, rate: float, stale_time: float = 0.04) -> None:
+        """Connect; without a new stamp for `stale_time` [s] the link counts as lost.
+
+        Raises RobotError where it cannot be had, SolverError without ur_rtde.
+        """
         try:
             from rtde_control import RTDEControlInterface
             from rtde_receive import RTDEReceiveInterface
         except ImportError as error:
             raise SolverError("no ur_rtde here; install it: pip install tpcd[robot]") from error
-        self.address, self.rate = address, rate
+        self.address, self.rate, self.stale_time = address, rate, stale_time
         self.alive = False
         """Whether commands that wait for an answer may be used."""
         self._last = 0.0
@@ -87,7 +88,7 @@ class Link:
 
     def next_sample(self) -> Sample:
         """Wait for the next reading; raises RobotError once the link or the arm has stopped."""
-        deadline = time.monotonic() + STALE
+        deadline = time.monotonic() + self.stale_time
         while True:
             stamp = self._receive.getTimestamp()
             if stamp != self._last:
@@ -96,8 +97,9 @@ class Link:
                 self.alive = False
                 connected = "the connection stands" if self._receive.isConnected() else "it is cut"
                 raise RobotError(
-                    f"{self.address}: no new reading for {1e3 * STALE:.0f} ms ({connected}); the"
-                    " arm holds its last target: see to it, then to network and controller"
+                    f"{self.address}: no new reading for {1e3 * self.stale_time:.0f} ms"
+                    f" ({connected}); the arm holds its last target: see to it, then to network and"
+                    " controller"
                 )
             time.sleep(2e-4)
         self._last = stamp

@@ -78,7 +78,9 @@ def check_zeroed(air: FreeAir) -> None:
 
 
 def check_tilted(left: FreeAir, right: FreeAir) -> float:
-    """The force that turns with the tool, each way [N]; raises RobotError for a wrong payload."""
+    """The force that turns with the tool, each way and beyond noise [N]; raises RobotError for a
+    wrong payload."""
+    both = (left, right)
     difference = float(np.linalg.norm((right.wrenches.mean(0) - left.wrenches.mean(0))[:2]))
     angle = abs(float(right.poses[:, 2].mean() - left.poses[:, 2].mean()))
     allowed = LARGEST_MASS * GRAVITY * angle
@@ -88,7 +90,8 @@ def check_tilted(left: FreeAir, right: FreeAir) -> float:
             f" free air, expected at most {allowed:.2f} N; the payload is wrong by about"
             f" {difference / (GRAVITY * angle):.2f} kg"
         )
-    return difference / 2
+    noise = sum(reading_noise(air)[:2] @ reading_noise(air)[:2] / len(air.stamps) for air in both)
+    return float(np.sqrt(max(0.0, difference**2 - noise))) / 2
 
 
 def reading_noise(air: FreeAir) -> Float[np.ndarray, " 3"]:

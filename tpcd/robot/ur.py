@@ -2,7 +2,7 @@
 
 Every reading is checked (fresh stamp, safety system, force, workspace, whether the arm follows) and
 recorded. Whatever ends a move, the arm holds; where its link and safety system allow, it then
-retreats: first the way the world pushes it, then up. All readings of a move are on disk before
+retreats: up, and to the left where it is pushed there. All readings of a move are on disk before
 the error reaches the caller.
 """
 
@@ -37,8 +37,8 @@ FOLLOWING = (0.015, 0.015, 0.1)
 """How far the arm may be from its target: the delay's way at full speed, several times over."""
 RAMP_SPEED = 0.03
 """Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
-RAMP_FORCE = 4.0
-"""Further force that ends a move in free air [N]."""
+RAMP_FORCE, RETREAT_FORCE = 4.0, 10.0
+"""Further force that ends a move in free air, and a retreat, at whose start friction turns [N]."""
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -68,8 +68,8 @@ class UniversalRobot:
         Raises RobotError with one line for each check that fails.
         """
         tcp = self._connect()
-        frame = self.settings
-        self._frame = task_frame(tcp, frame.x_axis, frame.z_axis, frame.origin)
+        said = self.settings
+        self._frame = task_frame(tcp, said.x_axis, said.z_axis, said.origin, said.tool_zero)
         with self._watched("preflight"):
             self._check_inside("the start pose", planar_pose(self._frame, tcp))
             std = self._check_free_air()
@@ -165,11 +165,12 @@ class UniversalRobot:
 
     def _connect(self) -> Float[np.ndarray, " 6"]:
         """The TCP pose of an arm that may be moved."""
+        settings = self.settings
         if self._link is None:
-            self._link = Link(self.settings.address, self.settings.rate)
+            self._link = Link(settings.address, settings.rate, settings.stale_time)
         sample = self._link.next_sample()
-        preflight.check_payload(self.settings.payload, self._link.payload())
-        if not self._confirm(self.settings.sentence()):
+        preflight.check_payload(settings.payload, self._link.payload())
+        if not self._confirm(settings.sentence()):
             raise RobotError(
                 "workspace and limits were not confirmed, so the arm was not moved; answer yes, or"
                 " pass --yes where nobody can"
@@ -202,11 +203,11 @@ class UniversalRobot:
         self._ramp_to(start)
         link.zero_sensor()
         noise = preflight.mean_noise(air, self._settling.window)
-        # Beside noise, a row is off by what counts as still, by the force's own noise, which the
-        # spring turns into motion, and by the weight not made up for.
+        # Beside its noise, a pose is off by what counts as still and by the force's noise, which
+        # the spring turns into motion; a force by the weight that is not made up for.
         left = np.hypot(0.5 * np.array(self._settling.residual), noise[3:])
         pose_std = np.hypot(noise[:3], left / np.array(settings.stiffness))
-        wrench_std = left
+        wrench_std = noise[3:].copy()
         wrench_std[:2] = np.hypot(wrench_std[:2], 0.5 * turning)
         return _tensor(np.concatenate((pose_std, wrench_std)))
 
@@ -290,8 +291,8 @@ class UniversalRobot:
         table = np.array(rows)
         return preflight.FreeAir(table[:, 0], table[:, 1:4], table[:, 4:7])
 
-    def _ramp_to(self, goal: Float[np.ndarray, " 3"], speed: float = RAMP_SPEED) -> None:
-        """Straight to a pose in free air; ends where a force comes up, with RobotError."""
+    def _ramp_to(self, goal: Float[np.ndarray, " 3"], allowed: float = RAMP_FORCE) -> None:
+        """Straight to a pose; RobotError where a force grows by more than `allowed` [N]."""
         link, frame = self._require_link(), self._frame
         assert frame is not None
         before: np.ndarray | None = None
@@ -300,30 +301,33 @@ class UniversalRobot:
             _, pose, wrench = self._read()
             state = self._state or at_rest(pose, np.zeros(3))
             before = wrench if before is None else before
-            if float((np.abs(wrench) - np.abs(before))[:2].max()) > RAMP_FORCE:
+            if float((np.abs(wrench) - np.abs(before))[:2].max()) > allowed:
                 raise RobotError(
                     f"the arm met a force of {np.abs(wrench[:2]).max():.1f} N on its way through"
                     " what should be free air"
                 )
             way = goal - state.reference
-            steps = max(np.hypot(way[0], way[1]) / speed, abs(way[2]) / (10 * speed)) * link.rate
+            steps = max(np.hypot(way[0], way[1]), abs(way[2]) / 10) / RAMP_SPEED * link.rate
             waited += steps < 1
             reference = state.reference + way / max(1.0, float(steps))
             self._state = AdmittanceState(reference, np.zeros(3), wrench)
             link.servo(tcp_of(frame, reference))
 
     def _retreat(self) -> None:
-        """Away along the force, then up; the arm holds where the way is not free."""
+        """Away from what may be touched, then up; the arm holds where the way is not free.
+
+        The world has a floor below and a wall on the right, and both may be felt only through
+        friction. So the way is up, and at first also to the left where the arm is pushed there.
+        """
         assert self._state is not None
-        force = self._state.wrench[:2]
-        size = float(np.linalg.norm(force))
         settings, here = self.settings, self._state.reference
-        self._over = -(10**6)  # The limit was exceeded: now the force may only fall.
-        away = force / size if size > 1.0 else np.array([0.0, 1.0])
-        for way in (0.5 * away, np.array([0.0, 1.0])):
-            goal = here + np.append(settings.retreat * way, 0.0)
+        self._over = -(10**6)  # The limit may be exceeded still: the ramp looks to the force.
+        left = -1.0 if float(self._state.wrench[0]) < -1.0 else 0.0
+        for way in (np.array([left, 1.0, 0.0]), np.array([0.0, 1.0, 0.0])):
+            goal = here + 0.5 * settings.retreat * way
             low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
-            self._ramp_to(np.clip(goal, np.minimum(low, here), np.maximum(high, here)))
+            goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
+            self._ramp_to(goal, RETREAT_FORCE)
             here = self._state.reference
 
     @contextmanager

@@ -16,7 +16,10 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
+from tpcd.discrepancy.adequacy import free_space_score, parity_score
+from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
+from tpcd.discrepancy.evidence import Question, fit_model
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.report_parts import shown_value
@@ -183,6 +186,58 @@ def test_coverage_of_the_diagnosis_motion_and_of_a_poor_one(clean: Episode) -> N
     free = replace(clean, poses=clean.commands.clone())
     poor = coverage_of([free])
     assert poor.missing(("floor load", "wall slip")) == ["floor load", "wall slip"]
+
+
+@pytest.mark.parametrize(
+    ("hidden", "parity", "free"),
+    [
+        ({}, False, False),
+        ({"floor_tilt": {"angle": 0.03}}, False, False),
+        ({"payload": {"weight": 1.0, "lever": 0.0}}, False, True),
+        ({"force_bias": {"F_x": 0.6, "F_z": -0.9, "tau": 0.0}}, True, False),
+        ({"command_lag": {"share": 0.1}}, True, True),
+    ],
+)
+def test_two_tests_without_theta_split_the_catalogue(
+    hidden: dict[str, dict[str, float]], parity: bool, free: bool
+) -> None:
+    episode = recorded(hidden, steps=60)
+    assert (parity_score(history_of(episode))[1] < 1e-3) == parity
+    found = free_space_score([episode])
+    assert found is not None and (found[1] < 1e-3) == free
+
+
+def test_rows_too_few_to_be_sure_of_say_nothing_of_free_space(clean: Episode) -> None:
+    assert free_space_score([clean.first(4)]) is None
+
+
+def test_effects_that_do_the_same_to_the_data_are_called_confusions() -> None:
+    one = torch.tensor([[0.0, 3.0, 4.0]], dtype=torch.float64)
+    plane = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    found = confusions({"a": one, "b": plane, "weak": 0.1 * one})
+    assert [(c.name, c.other) for c in found] == [("a", "b"), ("a", "weak")]
+    assert found[0].likeness == pytest.approx(1.0)
+    # Of b's first direction, a explains 3 / 5.
+    assert confusions({"b": 2 * plane, "a": one})[0].name == "a"
+
+
+def test_press_and_slide_hardly_tell_gain_from_stiffness(shape: PolygonShape) -> None:
+    generator = torch.Generator().manual_seed(5)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    motion = make_motion("press_and_slide", scene, 60, generator)
+    truth = make_truth(scene, "quasistatic", {}, 60)
+    poor = record(truth, scene, motion, 60, generator).measured
+    alike = []
+    for episode in (recorded({}, steps=60), poor):
+        question = Question(
+            joined_history([episode]), make_prior(shape), MisfitField(1e-4, 1.0), StepSettings(),
+            SMALL.sampler,
+        )  # fmt: skip
+        effects = [find_effect(n) for n in ("force_gain", "stiffness_error")]
+        own, other = signatures(question, fit_model(question, (), (0,)), effects).values()
+        span = torch.linalg.qr(other.T).Q
+        alike.append(float((span.T @ own[0]).norm() / own[0].norm()))
+    assert alike[1] > alike[0] + 0.03
 
 
 def test_gaps_and_bounds_of_numbers_known_by_hand() -> None:

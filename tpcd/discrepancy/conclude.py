@@ -72,6 +72,8 @@ def conclude(
         detection_limits=detection_limits(
             bench.glances, settings.catalogue, bench.coverage, settings.least_gain
         ),
+        confusions=tuple(bench.confusions),
+        tests=dict(bench.tests),
         coverage=dict(bench.coverage.counts),
         notes=tuple(bench.notes),
         belief=belief,

@@ -112,6 +112,16 @@ class Limit:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class Confusion:
+    """Where `name` is at hand, these data could be explained by `other` as well."""
+
+    name: str
+    other: str
+    likeness: float
+    """Share of what the effect does to the data that the other can do too, 0 to 1."""
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """All of it; `belief` is the posterior under the final model, `belief_before` that without."""
@@ -138,7 +148,12 @@ class Diagnosis:
     shape: str = ""
     """What the data say of the outline beyond the shape prior."""
     detection_limits: tuple[Limit, ...] = ()
+    confusions: tuple[Confusion, ...] = ()
+    """Effects that these data could not tell apart."""
     coverage: dict[str, float] = field(default_factory=dict)
+    tests: dict[str, float] = field(default_factory=dict)
+    """Mean chi-square for each degree of freedom, and its probability under noise alone, of two
+    tests that need no theta: `parity` of pose and wrench, and `free_space` of pose and command."""
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
     belief: Belief | None = None

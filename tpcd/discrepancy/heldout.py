@@ -148,7 +148,8 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[lis
         )
     # All channels together, each in units of its noise.
     was, now = ((part / floor).mean() - 1 for part in squares)
-    share = float((was - now.clamp_min(0.0)) / was) if was > 0.05 else math.nan
+    chance = max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / (n * len(CHANNELS))))
+    share = float((was - now.clamp_min(0.0)) / was) if was > chance else math.nan
     return found, share
 
 

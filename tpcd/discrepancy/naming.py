@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
+from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, Coverage
-from tpcd.discrepancy.diagnosis import Alternative, Candidate
+from tpcd.discrepancy.diagnosis import Alternative, Candidate, Confusion
 from tpcd.discrepancy.evidence import Fit, Question, fit_model, joined_fit
 from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance, glance
@@ -48,11 +49,18 @@ class Workbench:
     notes: list[str] = field(default_factory=list)
     glances: list[Glance] = field(default_factory=list)
     """Of the first round."""
+    confusions: list[Confusion] = field(default_factory=list)
+    tests: dict[str, float] = field(default_factory=dict)
+    """What needs no theta: mean chi-square of parity and of free space, with probabilities."""
 
     def warn(self, line: str) -> None:
         """Note something, and say it at once."""
         self.notes.append(" ".join(line.split()))
         self.tell(f"warning: {self.notes[-1]}")
+
+    def excited(self, effects: Sequence[Effect]) -> list[Effect]:
+        """Those of the effects that the data could show."""
+        return [effect for effect in effects if not self.coverage.missing(effect.needs)]
 
     def adequacy(self, fit: Fit) -> Adequacy:
         """What a model leaves."""
@@ -77,6 +85,15 @@ def fit_well(bench: Workbench, effects: Sequence[Effect], start: Sequence[Fit] =
     if fit.spread > 2.0:
         fit = joined_fit(fit, fit_model(bench.question, effects, (2,), start=(*start, fit)))
     return fit
+
+
+def find_confusions(bench: Workbench, base: Fit) -> None:
+    """Note which effects these data could not tell apart, whatever their truth is."""
+    effects = bench.excited(bench.settings.catalogue)
+    bench.confusions[:] = confusions(signatures(bench.question, base, effects))
+    if bench.confusions:
+        pairs = ", ".join(f"{c.name} from {c.other}" for c in bench.confusions)
+        bench.tell(f"preflight: these data hardly tell {pairs}")
 
 
 def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: bool) -> Round:
@@ -153,7 +170,7 @@ def _glances(
 ) -> list[Glance]:
     """A quick look at every effect that the data excite, the best first."""
     candidates = [effect for effect in pool if effect.name not in current.names]
-    excited = [e for e in candidates if not bench.coverage.missing(e.needs)]
+    excited = bench.excited(candidates)
     for effect in candidates:
         if effect not in excited:
             lacks = ", ".join(bench.coverage.missing(effect.needs))

@@ -14,14 +14,22 @@ from tpcd.belief.belief import EstimatorSettings, misfit_field
 from tpcd.belief.history import joined_history
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.adequacy import Adequacy, parity_score
+from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.evidence import Fit, Question, fit_model, joined_fit
 from tpcd.discrepancy.formula import FORMULAS
 from tpcd.discrepancy.memory import Memory
-from tpcd.discrepancy.naming import Round, Workbench, better_base, fit_well, name_one, pruned
+from tpcd.discrepancy.naming import (
+    Round,
+    Workbench,
+    better_base,
+    find_confusions,
+    fit_well,
+    name_one,
+    pruned,
+)
 from tpcd.discrepancy.settings import FEWEST_ROWS, FINAL_SEEDS, DiagnosisSettings
 from tpcd.discrepancy.variants import FINER, Variant, step_halving
 from tpcd.effects.protocol import Effect
@@ -49,7 +57,7 @@ def diagnose(
     settings = settings or DiagnosisSettings()
     question = _question(episodes, shape, settings, memory or Memory())
     bench = Workbench(question, settings, coverage_of(episodes), len(effects), tell)
-    stop = _preflight(bench)
+    stop = _preflight(bench, episodes)
     if stop:
         tell(f"verdict: not enough information: {stop}")
         found = Diagnosis("not_enough_information", stop, coverage=dict(bench.coverage.counts))
@@ -78,7 +86,7 @@ def _question(
     )
 
 
-def _preflight(bench: Workbench) -> str:
+def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
     """Why the data cannot say anything; empty where they can."""
     question, counts = bench.question, bench.coverage.counts
     rows = int(question.history.used.sum())
@@ -88,10 +96,18 @@ def _preflight(bench: Workbench) -> str:
         found = f"{rows} transitions, {contact:.0f} of them in contact"
         return f"{found}; a diagnosis needs {needed} transitions and 3 in contact"
     mean, p = parity_score(question.history)
+    bench.tests |= {"parity": mean, "parity_p": p}
     bench.tell(
         f"preflight: {rows} transitions, {contact:.0f} rows in contact; pose and wrench"
         f" disagree by {mean:.2f} times their noise (p = {p:.2g})"
     )
+    free = free_space_score(episodes)
+    if free is not None:
+        bench.tests |= {"free_space": free[0], "free_space_p": free[1]}
+        bench.tell(
+            f"preflight: in free space poses leave their commands by {free[0]:.2f} times the noise"
+            f" (p = {free[1]:.2g}, {free[2]} rows)"
+        )
     return ""
 
 
@@ -100,6 +116,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     settings = bench.settings
     base = current = fit_well(bench, effects)
     before = bench.adequacy(base)
+    find_confusions(bench, base)
     tell_adequacy(bench, "the model as it is", before)
     variants: list[Variant] = []
     close = ()

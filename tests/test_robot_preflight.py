@@ -66,16 +66,19 @@ def test_a_wrong_payload_shows_when_the_tool_tilts() -> None:
     assert check_tilted(*slight) == pytest.approx(small, abs=0.03)
 
 
-def test_the_noise_of_a_mean_is_that_of_independent_readings_or_more() -> None:
-    """30 recordings; 5 batch means scatter by a third, their larger half counts."""
-    found = np.array([mean_noise(air(seed=seed), 0.6)[3:] for seed in range(30)]).mean(0)
+def test_the_noise_of_a_mean_is_that_of_independent_readings() -> None:
+    """200 recordings; slow noise is seen by chance in 1 % of 600 channels."""
+    found = [mean_noise(air(seed=seed), 0.6) for seed in range(200)]
     expected = NOISE / np.sqrt(0.6 * RATE)
-    assert (found > 0.98 * expected).all() and (found < 1.35 * expected).all()
+    np.testing.assert_allclose(np.mean([fast for fast, _ in found], axis=0)[3:], expected, 0.03)
+    assert np.mean([slow[3:] > 0 for _, slow in found]) < 0.03
     np.testing.assert_allclose(reading_noise(air(seconds=20.0)), NOISE, rtol=0.06)
 
 
-def test_slow_noise_counts_in_full() -> None:
-    slow = air(seconds=6.0)
-    wave = 0.3 * np.sin(2 * np.pi * slow.stamps / 2.5)
-    wrenches = slow.wrenches + wave[:, None]
-    assert mean_noise(FreeAir(slow.stamps, slow.poses, wrenches), 0.6)[3] > 0.15
+def test_slow_noise_is_told_apart() -> None:
+    still = air(seconds=6.0)
+    wave = 0.3 * np.sin(2 * np.pi * still.stamps / 2.5)
+    swaying = FreeAir(still.stamps, still.poses, still.wrenches + wave[:, None])
+    fast, slow = mean_noise(swaying, 0.6)
+    assert 0.15 < slow[3] < 0.3
+    np.testing.assert_allclose(fast[3:], NOISE / np.sqrt(0.6 * RATE), rtol=0.1)

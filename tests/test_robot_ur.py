@@ -58,8 +58,8 @@ def test_moves_are_springs_and_every_reading_is_kept(emulator, tmp_path: Path) -
         scene = emulated_scene(emulator)
         torch.testing.assert_close(episode.poses[0], scene.start_pose, atol=1e-4, rtol=0)
         assert episode.priors == {"friction": (0.1, 0.9)}
-        # 0.2 N at 125 Hz over 0.6 s, and what counts as still.
-        assert 0.02 < float(episode.sensor_std[4]) < 0.1
+        # What counts as still; the fast noise, 0.2 N at 125 Hz over 0.6 s, has become motion.
+        assert 0.014 < float(episode.sensor_std[4]) < 0.06
         assert 1e-4 < float(episode.sensor_std[0]) < 1e-3
         x, z, _ = episode.poses[0].tolist()
         touch = command(x, z - 0.05)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import chi2
 
 from tpcd.errors import RobotError
 
@@ -99,21 +100,26 @@ def reading_noise(air: FreeAir) -> Float[np.ndarray, " 3"]:
     return np.diff(air.wrenches, axis=0).std(0) / np.sqrt(2)
 
 
-def mean_noise(air: FreeAir, window: float) -> Float[np.ndarray, " 6"]:
-    """Standard deviation of the mean pose and wrench over so many seconds.
+def mean_noise(
+    air: FreeAir, window: float
+) -> tuple[Float[np.ndarray, " 6"], Float[np.ndarray, " 6"]]:
+    """Standard deviations of the mean pose and wrench over so many seconds, from fast and from
+    slow noise.
 
-    The larger of what independent readings would have and of what the means of the windows in
-    `air` have, which also holds slow noise and drift.
+    Fast is what independent readings have. Slow, such as drift, is what the means of the windows
+    in `air` scatter by, zero where chance explains it (probability 0.01).
     """
     values = np.concatenate((air.poses, air.wrenches), axis=1)
     duration = float(air.stamps[-1] - air.stamps[0])
     count = max(1, round(len(values) * window / duration))
-    independent = values.std(0) / np.sqrt(count)
+    fast = np.diff(values, axis=0).std(0) / np.sqrt(2 * count)
     batches = len(values) // count
     if batches < 3:
-        return independent
+        return fast, np.zeros(6)
     means = values[: batches * count].reshape(batches, count, 6).mean(1)
-    return np.maximum(independent, means.std(0, ddof=1))
+    scatter = means.std(0, ddof=1)
+    chance = chi2.ppf(0.99, batches - 1) / (batches - 1)
+    return fast, np.where(scatter**2 > chance * fast**2, scatter, 0.0)
 
 
 def _slope_noise(air: FreeAir) -> float:

@@ -57,7 +57,8 @@ class UniversalRobot:
         self._link: Link | None = None
         self._frame: TaskFrame | None = None
         self._state: AdmittanceState | None = None
-        self._noise = np.zeros(3)
+        self._first: np.ndarray | None = None
+        self._noise, self._std = np.zeros(3), torch.zeros(6, dtype=torch.float64)
         self._over, self._row = 0, 0
         self.at_rest: str | None = None
         """How the arm was left after a stop; None while it may be moved."""
@@ -72,20 +73,24 @@ class UniversalRobot:
         self._frame = task_frame(tcp, said.x_axis, said.z_axis, said.origin, said.tool_zero)
         with self._watched("preflight"):
             self._check_inside("the start pose", planar_pose(self._frame, tcp))
-            std = self._check_free_air()
-            air = self._stand(self._settling.window)
+            self._std = self._check_free_air()
+            first = self._first_row()
         self._write_frame()
-        pose, wrench = _tensor(air.poses.mean(0)), _tensor(air.wrenches.mean(0))
-        return Episode(
-            commands=pose[None].clone(),
-            poses=pose[None],
-            wrenches=wrench[None],
-            stiffness=_tensor(np.array(self.settings.stiffness)),
-            sensor_std=std,
-            object=self.settings.object,
-            notes=self.settings.notes,
-            priors=dict(self.settings.priors),
-        )
+        return first
+
+    def restart(self) -> Episode:
+        """Leave what is touched, go back to the start pose and zero the sensor there; a new episode
+        of the same set-up, whose rows are counted on in `raw`. Raises RobotError."""
+        if self._first is None:
+            raise RobotError("the arm has not started, so there is no start to go back to")
+        with self._watched(f"back_{self._row:03d}"):
+            self._retreat()
+            assert self._state is not None
+            height = max(float(self._state.reference[1]), float(self._first[1]))
+            self._ramp_to(np.array([self._first[0], height, self._first[2]]))
+            self._ramp_to(self._first)
+            self._require_link().zero_sensor()
+            return self._first_row()
 
     def settle(self, command: Float[Tensor, " 3"]) -> Reading:
         """Give way to the command until pose and force are steady, and average them.
@@ -202,14 +207,31 @@ class UniversalRobot:
         self._ramp_to(above)
         self._ramp_to(start)
         link.zero_sensor()
-        noise = preflight.mean_noise(air, self._settling.window)
-        # Beside its noise, a pose is off by what counts as still and by the force's noise, which
-        # the spring turns into motion; a force by the weight that is not made up for.
-        left = np.hypot(0.5 * np.array(self._settling.residual), noise[3:])
-        pose_std = np.hypot(noise[:3], left / np.array(settings.stiffness))
-        wrench_std = noise[3:].copy()
+        fast, slow = preflight.mean_noise(air, self._settling.window)
+        # A row is taken once the mean wrench is K (r - u) to within what counts as still, so the
+        # fast noise of the force is no longer in the force: the spring has turned it into motion.
+        still = 0.5 * np.array(self._settling.residual)
+        moved = np.sqrt(still**2 + fast[3:] ** 2 + slow[3:] ** 2) / np.array(settings.stiffness)
+        pose_std = np.sqrt(fast[:3] ** 2 + slow[:3] ** 2 + moved**2)
+        wrench_std = np.hypot(still, slow[3:])
         wrench_std[:2] = np.hypot(wrench_std[:2], 0.5 * turning)
         return _tensor(np.concatenate((pose_std, wrench_std)))
+
+    def _first_row(self) -> Episode:
+        """The episode of the pose at which the arm stands free."""
+        air, settings = self._stand(self._settling.window), self.settings
+        first = self._first = air.poses.mean(0)
+        pose, wrench = _tensor(first), _tensor(air.wrenches.mean(0))
+        return Episode(
+            commands=pose[None].clone(),
+            poses=pose[None],
+            wrenches=wrench[None],
+            stiffness=_tensor(np.array(settings.stiffness)),
+            sensor_std=self._std,
+            object=settings.object,
+            notes=settings.notes,
+            priors=dict(settings.priors),
+        )
 
     def _settle(self, command: Float[np.ndarray, " 3"]) -> Reading:
         link, frame = self._require_link(), self._frame
@@ -329,6 +351,7 @@ class UniversalRobot:
             goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
             self._ramp_to(goal, RETREAT_FORCE)
             here = self._state.reference
+        self._over = 0
 
     @contextmanager
     def _watched(self, name: str, **about: object) -> Iterator[None]:

@@ -1,0 +1,295 @@
+"""The paper's physical experiment, through an emulated controller instead of an arm.
+
+An object in the hand, an expert's trajectory of 15 moves, and a testing trajectory, on tiles that
+yield 1 to 3 mm at 10 N; friction U[0.5, 1.6], wall U[-0.90, -0.80] m along x of the base (arXiv
+2409.17470, section V-B). The real ur_rtde client drives the emulator of tpcd.robot, so this is the
+whole chain but for the arm: it is emulated and not measured on a robot, and the table says so. The
+gap workflow (scripts/diagnose.py) looks at a third recording, which excites what may be missing.
+
+python -m eval.physical --out runs/physical
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tpcd.cli import check_numbers, run
+
+if TYPE_CHECKING:
+    from tpcd.belief import Belief
+    from tpcd.data.episode import Episode
+    from tpcd.effects.model import Model
+    from tpcd.robot.emulator import EmulatorSettings
+    from tpcd.robot.ur import UniversalRobot
+    from tpcd.truth.motions import Motion
+
+PAPER: dict[str, Any] = {
+    "object": "paper, Real",
+    "estimator": "paper",
+    "F_x_N": 0.49,
+    "F_z_N": 0.21,
+    "x_mm": 5.9,
+    "z_mm": 1.9,
+}
+"""The row `Real` of the paper's table, as it prints it."""
+COVARIANCE = (20.0, 20.0, 0.5, 0.1, 0.1, 0.1)
+"""R of the paper's filter on the robot."""
+ORIGIN = (-0.70, 0.0, 0.1)
+"""Of the task in the base frame, x pointing along -x of the base: the wall is at 0.10 to 0.20 m."""
+WALL_BASE = (-0.90, -0.80)
+FRICTION = (0.5, 1.6)
+SESSIONS = ("expert", "test", "diagnosis")
+
+
+@dataclass(frozen=True)
+class Physical:
+    """Settings of the experiment."""
+
+    out: Path = Path("runs/physical")
+    """Folder for episodes, diagnoses and the table."""
+    objects: tuple[str, ...] = ("006_mustard_bottle", "025_mug", "014_lemon")
+    """Objects, by their YCB names."""
+    tiles: tuple[float, ...] = (2.0, 1.0, 3.0)
+    """Yield of the tiles for each object [mm per 10 N]."""
+    steps: int = 15
+    """Moves of the expert."""
+    test_steps: int = 30
+    """Moves of the testing trajectory."""
+    diagnosis_steps: int = 60
+    """Moves of the recording that the gap workflow looks at; 0 leaves it out."""
+    prior: str = "ycb-rich"
+    """Shape prior of ours; the paper's filter has ycb21-z2."""
+    address: str = "127.0.7.1"
+    """Loopback address of the emulator."""
+    seed: int = 0
+    """Seed of scenes, noise and motions."""
+    resume: bool = False
+    """Keep what an earlier run in the folder has recorded."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, least={"steps": 1, "test_steps": 1, "diagnosis_steps": 0})
+        if len(self.tiles) != len(self.objects):
+            raise ValueError(
+                f"tiles has {len(self.tiles)} numbers, expected one for each of the"
+                f" {len(self.objects)} objects"
+            )
+
+
+def evaluate_physical(config: Physical) -> None:
+    """Run the paper's physical protocol through the emulator and print its table."""
+    import torch
+
+    from tpcd.results import continue_run, format_table, open_run, write_results
+
+    torch.set_num_threads(1)
+    if config.resume:
+        folder = continue_run(config.out, config, free=("out", "resume", "overwrite"))
+    else:
+        folder = open_run(config.out, "python -m eval.physical", config, config.overwrite)
+    rows: list[dict[str, Any]] = [PAPER]
+    for index, name in enumerate(config.objects):
+        recorded = _recorded(config, index, folder / name)
+        rows += _rows(config, config.tiles[index], name, recorded, folder / name)
+        print(format_table(rows), flush=True)
+    ours = dict.fromkeys(row["estimator"] for row in rows[1:])
+    for estimator in ours:
+        rows.append(_mean(estimator, [row for row in rows[1:] if row["estimator"] == estimator]))
+    print(format_table(rows[-len(ours) :]))
+    write_results(folder, rows, seeds=[config.seed], kind="emulated, not measured on a robot")
+
+
+def _recorded(config: Physical, index: int, folder: Path) -> dict[str, Episode]:
+    """The sessions of an object: read where they are, else driven through the emulator."""
+    from tpcd.data.episode import read_episode, write_episode
+    from tpcd.robot.emulator import EmulatorSettings
+    from tpcd.robot.emulator.process import running_emulator
+
+    wall = (ORIGIN[0] - WALL_BASE[1], ORIGIN[0] - WALL_BASE[0])
+    settings = EmulatorSettings(
+        config.address,
+        config.objects[index],
+        config.seed + index,
+        FRICTION,
+        wall,
+        config.tiles[index],
+        "-x",
+        ORIGIN,
+        pace="client",
+    )
+    sessions = [name for name in SESSIONS if name != "diagnosis" or config.diagnosis_steps]
+    paths = {name: folder / f"{name}.csv" for name in sessions}
+    missing = [name for name in sessions if not paths[name].is_file()]
+    if missing:
+        with running_emulator(settings):
+            for name, episode in _driven(config, settings, sessions, folder / "raw"):
+                write_episode(episode, paths[name], overwrite=True)
+    return {name: read_episode(path) for name, path in paths.items()}
+
+
+def _driven(
+    config: Physical, settings: EmulatorSettings, sessions: Sequence[str], raw: Path
+) -> Iterator[tuple[str, Episode]]:
+    """The sessions of the arm, each from the start pose."""
+    from tqdm import tqdm
+
+    from tpcd.robot.arm_settings import ArmSettings
+    from tpcd.robot.emulator.settings import TOOL_DOWN
+    from tpcd.robot.ur import UniversalRobot
+    from tpcd.truth.motions import History
+
+    arm = UniversalRobot(
+        ArmSettings(
+            settings.address,
+            x_axis=settings.x_axis,
+            origin=settings.origin,
+            tool_zero=TOOL_DOWN,
+            surface_mm_per_10n=settings.surface_mm_per_10n,
+            stale_time=1.0,
+            payload=settings.payload,
+            priors={"friction": FRICTION, "wall_position": settings.wall},
+            object=settings.outline,
+            notes=f"emulated, tiles {settings.surface_mm_per_10n:g} mm per 10 N",
+        ),
+        raw,
+        lambda _: True,
+    )
+    try:
+        for count, session in enumerate(sessions):
+            rows = arm.restart() if count else arm.start()
+            motion, steps = _motion(config, settings, session, rows)
+            for _ in tqdm(range(steps), desc=f"{settings.outline} {session}", unit="move"):
+                history = History(rows.commands, rows.poses, rows.wrenches, rows.stiffness)
+                command = motion.next_command(history)
+                reading = arm.settle(command)
+                rows = rows.with_row(command, reading.pose, reading.wrench)
+            yield session, rows
+    finally:
+        _leave(arm)
+
+
+def _leave(arm: UniversalRobot) -> None:
+    try:
+        arm.stop()
+    finally:
+        arm.close()
+
+
+def _motion(
+    config: Physical, settings: EmulatorSettings, session: str, start: Episode
+) -> tuple[Motion, int]:
+    """The motion of a session, and how many moves it has."""
+    from tpcd.random import stream
+    from tpcd.robot.emulator import emulated_scene
+    from tpcd.truth.diagnosis_motion import diagnosis_motion
+    from tpcd.truth.motions import expert_motion, planned_test
+
+    scene = emulated_scene(settings)
+    generator = stream(settings.seed, SESSIONS.index(session))
+    if session == "expert":
+        return expert_motion(scene.wall_position), config.steps
+    if session == "diagnosis":
+        return diagnosis_motion(generator), config.diagnosis_steps
+    planned = planned_test(
+        scene.vertices_ee,
+        scene.floor_height,
+        scene.wall_position,
+        start.poses[0],
+        config.test_steps,
+        generator,
+        start.stiffness,
+    )
+    return planned, config.test_steps
+
+
+def _rows(
+    config: Physical, tiles: float, name: str, recorded: dict[str, Episode], folder: Path
+) -> list[dict[str, Any]]:
+    """A row of the table for each estimator: mean errors of the test's next poses and wrenches."""
+    from tpcd.belief import EstimatorSettings, estimate
+    from tpcd.belief.paper import PaperSettings, estimate_paper
+    from tpcd.random import stream
+    from tpcd.shape.checkpoint import load_prior
+
+    expert, test = recorded["expert"], recorded["test"]
+    paper = estimate_paper(
+        expert, load_prior("ycb21-z2"), stream(config.seed, 7), PaperSettings(covariance=COVARIANCE)
+    )
+    ours = estimate(expert, load_prior(config.prior), stream(config.seed, 8), EstimatorSettings())
+    rows = [
+        _row(name, tiles, "paper's filter", list(paper)[-1].belief, test),
+        _row(name, tiles, "ours, rigid tiles", list(ours)[-1].belief, test),
+    ]
+    model, found = _found(config, recorded, folder)
+    if model is not None:
+        settings = EstimatorSettings(step=model.step, effects=model.effects)
+        added = estimate(expert, load_prior(config.prior), stream(config.seed, 8), settings)
+        row = _row(name, tiles, "ours, gap found", list(added)[-1].belief, test)
+        rows.append({**row, "found": found})
+    elif found:
+        rows[-1]["found"] = found
+    return rows
+
+
+def _found(
+    config: Physical, recorded: dict[str, Episode], folder: Path
+) -> tuple[Model | None, str | None]:
+    """What the gap workflow adds to the model, and how it says so."""
+    import json
+    import subprocess
+    import sys
+
+    from tpcd.effects.model import load_model
+
+    if "diagnosis" not in recorded:
+        return None, None
+    out = folder / "diagnosis"
+    if not (out / "verdict.json").is_file():
+        arguments = [str(folder / "diagnosis.csv"), "--fresh", str(folder / "test.csv")]
+        subprocess.run(
+            [sys.executable, "scripts/diagnose.py", *arguments, "--prior", config.prior]
+            + ["--out", str(out), "--seed", str(config.seed), "--overwrite"],
+            check=False,
+        )
+    if not (out / "verdict.json").is_file():
+        return None, "the diagnosis failed"
+    verdict = json.loads((out / "verdict.json").read_text(encoding="utf-8"))
+    text = str(verdict.get("verdict", verdict.get("kind", "")))
+    path = out / "model.yaml"
+    return (load_model(path) if path.is_file() else None), text
+
+
+def _row(name: str, tiles: float, estimator: str, belief: Belief, test: Episode) -> dict[str, Any]:
+    from tpcd.commands.prediction import measured_rows, one_step, prediction_error
+    from tpcd.predict import ContactPredictor
+
+    predicted = one_step(ContactPredictor(belief), test, "measured")
+    rows = measured_rows(test)[1:]
+    x, z, angle, force_x, force_z, torque = (
+        prediction_error(rows, predicted.mean).abs().mean(0).tolist()
+    )
+    return {
+        "object": f"{name}, emulated",
+        "tiles": tiles,
+        "estimator": estimator,
+        "F_x_N": force_x,
+        "F_z_N": force_z,
+        "tau_Nm": torque,
+        "x_mm": 1e3 * x,
+        "z_mm": 1e3 * z,
+        "phi_mrad": 1e3 * angle,
+    }
+
+
+def _mean(estimator: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    numbers = ("F_x_N", "F_z_N", "tau_Nm", "x_mm", "z_mm", "phi_mrad")
+    means = {key: sum(row[key] for row in rows) / len(rows) for key in numbers}
+    return {"object": f"MEAN of {len(rows)}, emulated", "estimator": estimator, **means}
+
+
+if __name__ == "__main__":
+    run(evaluate_physical, Physical)

@@ -186,6 +186,8 @@ def test_a_stopped_run_goes_on_and_a_slipped_object_does_not(emulator, tmp_path:
     finally:
         again.stop()
         again.close()
+    names = {path.stem for path in tmp_path.glob("row_*.parquet")}
+    assert names == {"row_001", "row_001-2", "row_002", "row_002-2", "row_003"}
     slipped = replace(episode, poses=episode.poses + command(0.0, 0.004)[None])
     slipped.poses[0] = episode.poses[0]
     third = arm_on(emulator, tmp_path)

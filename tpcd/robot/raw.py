@@ -1,8 +1,9 @@
 """All readings of a move, in Parquet beside the episode: `raw/row_007.parquet` for row 7.
 
-A file for each row, written as soon as the move ends however it ends, so that nothing is lost. Its
-metadata name the row, the command and how the move ended. Columns: stamp and time of receipt [s],
-TCP pose and target in the base frame, wrench along base axes, and what the task sees of them.
+A file for each row, written as soon as the move ends however it ends, so that nothing is lost; a
+move that is made again after a stop gets a file of its own, `row_007-2.parquet`. Its metadata name
+the row, the command and how the move ended. Columns: stamp and time of receipt [s], TCP pose and
+target in the base frame, wrench along base axes, and what the task sees of them.
 """
 
 from __future__ import annotations
@@ -61,7 +62,10 @@ class RawRecord:
         self._rows.append(np.concatenate(parts))
 
     def write(self, folder: Path, name: str, about: Mapping[str, Any]) -> Path | None:
-        """Write NAME.parquet in one move and start anew; None where nothing was read."""
+        """Write NAME.parquet in one move and start anew; None where nothing was read.
+
+        A file of that name stays, and this one becomes NAME-2, NAME-3, ...
+        """
         if not self._rows:
             return None
         import pyarrow
@@ -72,7 +76,10 @@ class RawRecord:
         content = pyarrow.table({key: table[:, i] for i, key in enumerate(COLUMNS)})
         content = content.replace_schema_metadata({"tpcd": json.dumps(dict(about))})
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{name}.parquet"
+        path, count = folder / f"{name}.parquet", 1
+        while path.exists():
+            count += 1
+            path = folder / f"{name}-{count}.parquet"
         temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             pyarrow.parquet.write_table(content, temporary)

@@ -95,8 +95,7 @@ class UniversalRobot:
     def settle(self, command: Float[Tensor, " 3"]) -> Reading:
         """Give way to the command until pose and force are steady, and average them.
 
-        Raises ValueError for a command outside of the workspace, RobotError where the arm had to
-        stop.
+        Raises RobotError for a command outside of the workspace, and where the arm had to stop.
         """
         target = command.detach().double().numpy()
         self._check_inside("a command", target)

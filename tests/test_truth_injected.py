@@ -213,6 +213,16 @@ def test_a_step_in_the_floor_lifts_what_passes_it():
     assert np.allclose(heights, [0.0, 0.002, 0.0], atol=LENGTH)
 
 
+def test_a_rippled_floor_lifts_by_its_waves():
+    rows = follow(
+        {"floor_ripple": {"height": 0.001, "length": 0.08}},
+        (0.02, 0.03, 0), (0.06, 0.03, 0), (-0.02, 0.03, 0), vertices=WEDGE, friction=0.2,
+    )  # fmt: skip
+    x, heights = np.array([lowest(WEDGE, row) for row in rows]).T
+    assert np.ptp(heights) > 0.0015
+    assert np.allclose(heights, 0.001 * np.sin(2 * np.pi * x / 0.08), atol=5 * LENGTH)
+
+
 def slide_ratios(hidden, depth=0.05, **scene) -> list[float]:
     """F_t / F_n on the floor after sliding right and left."""
     z = 0.03 - depth

@@ -45,9 +45,18 @@ MEDIUM: Sizes = {
 OUTSIDE: Sizes = {
     "floor_step": {"height": 3e-3, "x": 0.05},
     "friction_field": {"slope": 6.0},
+    "floor_ripple": {"height": 1.5e-3, "length": 0.06},
 }
-"""Effects that the catalogue does not have; MuJoCo alone can be given them."""
-PLACES = frozenset({("payload", "lever"), ("floor_step", "x"), ("grasp_slip", "at")})
+"""Effects that the catalogue does not have, the last not even a formula; MuJoCo alone can be given
+them."""
+PLACES = frozenset(
+    {
+        ("payload", "lever"),
+        ("floor_step", "x"),
+        ("floor_ripple", "length"),
+        ("grasp_slip", "at"),
+    }
+)
 """Parameters that say where or when: the same for small effects."""
 RANGES = {("grasp_slip", "at"): (0.3, 0.7)}
 """Parameters that are drawn from a range instead of around a size."""

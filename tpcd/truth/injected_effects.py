@@ -47,6 +47,7 @@ FORMS = {
     "wall_tilt": ANGLE,
     "floor_curvature": EffectForm(("curvature",)),
     "floor_step": EffectForm(("height",), ("x",)),
+    "floor_ripple": EffectForm(("height",), ("length",)),
     "floor_drift": EffectForm(("drift",)),
     "wall_friction": LOG_RATIO,
     "directional_friction": LOG_RATIO,

@@ -53,23 +53,35 @@ class FloorShape:
     step_height: float = 0.0
     step_x: float = 0.0
     """The step rises from here over `STEP_LENGTH` [m]."""
+    ripple_height: float = 0.0
+    """Amplitude of a wave along the floor [m]."""
+    ripple_length: float = 1.0
+    """Length of the wave [m]."""
 
     @property
     def is_flat(self) -> bool:
         """Whether one plane will do."""
-        return self.curvature == 0.0 and self.step_height == 0.0
+        return self.curvature == self.step_height == self.ripple_height == 0.0
+
+    @property
+    def ripple_number(self) -> float:
+        """Radians of the wave for each metre."""
+        return 2.0 * math.pi / self.ripple_length
 
     def height(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Height [m] at x [m]."""
         share = np.clip((x - self.step_x) / STEP_LENGTH, 0.0, 1.0)
         step = self.step_height * share**2 * (3.0 - 2.0 * share)
-        return self.slope * x + self.curvature * x**2 / 2 + step
+        ripple = self.ripple_height * np.sin(self.ripple_number * x)
+        return self.slope * x + self.curvature * x**2 / 2 + step + ripple
 
     def rise(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Angle of the floor from x towards z [rad] at x [m]."""
         share = np.clip((x - self.step_x) / STEP_LENGTH, 0.0, 1.0)
         step = self.step_height * 6.0 * share * (1.0 - share) / STEP_LENGTH
-        return np.arctan(self.slope + self.curvature * x + step)
+        number = self.ripple_number
+        ripple = self.ripple_height * number * np.cos(number * x)
+        return np.arctan(self.slope + self.curvature * x + step + ripple)
 
 
 def floor_shape(effects: ActiveEffects) -> FloorShape:
@@ -79,6 +91,8 @@ def floor_shape(effects: ActiveEffects) -> FloorShape:
         effects.get("floor_curvature", "curvature"),
         effects.get("floor_step", "height"),
         effects.get("floor_step", "x"),
+        effects.get("floor_ripple", "height"),
+        effects.get("floor_ripple", "length") or 1.0,
     )
 
 
@@ -94,9 +108,10 @@ def floor_points(
     close along the outline that the floor enters by 5 µm between them (or every 1 mm), and
     kept if they come near the lowest one at some turn within `LARGEST_TURN` of `angle`.
     """
-    if shape.step_height == 0.0 and shape.curvature >= 0.0:
+    if shape.step_height == shape.ripple_height == 0.0 and shape.curvature >= 0.0:
         return hull
     bend = abs(shape.curvature) + 6.0 * abs(shape.step_height) / STEP_LENGTH**2
+    bend += abs(shape.ripple_height) * shape.ripple_number**2
     spacing = min(max(math.sqrt(8.0 * 5e-6 / bend), 1e-3), 4e-3)
     points = []
     for first, second in zip(outline_ee, np.roll(outline_ee, -1, axis=0), strict=True):
@@ -105,6 +120,7 @@ def floor_points(
     candidates = np.concatenate((hull, *points))
     span = float(np.ptp(hull, axis=0).max())
     bulge = abs(shape.curvature) * span**2 / 2 + abs(shape.step_height) + 1e-4
+    bulge += 2.0 * abs(shape.ripple_height)
     turns = angle + np.linspace(-LARGEST_TURN, LARGEST_TURN, 41)
     heights = candidates @ np.array([np.sin(turns), np.cos(turns)])
     near = (heights - heights.min(axis=0) < bulge).any(axis=1)

@@ -225,7 +225,7 @@ def _rows(
         _row(name, tiles, "ours, rigid tiles", list(ours)[-1].belief, test),
     ]
     model, found = _found(config, recorded, folder)
-    if model is not None:
+    if model is not None and model.effects:
         settings = EstimatorSettings(step=model.step, effects=model.effects)
         added = estimate(expert, load_prior(config.prior), stream(config.seed, 8), settings)
         row = _row(name, tiles, "ours, gap found", list(added)[-1].belief, test)

@@ -21,7 +21,9 @@ from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
+    CLOSER,
     FRESH,
+    IMPROVED,
     SURE,
     VETO_LEVEL,
     WITHIN,
@@ -121,7 +123,17 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     near.sort(key=lambda fit: -fit.log_evidence)
     if settings.base_refit and near:
         again = fit_model(question, current.effects, (10,), start=(current, *near[:2]))
+        better = again.log_evidence > current.log_evidence + IMPROVED
         current = joined_fit(current, again)
+        if better:
+            # What the base model has learnt from the alternatives, they may learn from it.
+            near = [
+                joined_fit(fit, fit_model(question, fit.effects, (11,), start=(current, fit)))
+                for fit in near[:2]
+            ]
+            near.sort(key=lambda fit: -fit.log_evidence)
+    if near and -SURE < near[0].log_evidence - current.log_evidence < SURE:
+        current, near = _looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)
         gain = (g if full is None else full).log_evidence - current.log_evidence
@@ -181,11 +193,28 @@ def _glances(
     return sorted(glances, key=lambda g: -g.log_evidence)
 
 
+def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit, list[Fit]]:
+    """The base model and the best candidate with a larger search, each from where both arrived:
+    where they are close, what the search over shapes has missed may decide."""
+    sampler = bench.settings.sampler
+    wide = replace(
+        bench.question,
+        sampler=replace(
+            sampler, fresh_modes=CLOSER * sampler.fresh_modes, draws=CLOSER * sampler.draws
+        ),
+    )
+    base = fit_model(wide, current.effects, (30,), start=(current, near[0]))
+    best = fit_model(wide, near[0].effects, (30,), start=(current, near[0]))
+    near = [joined_fit(near[0], best), *near[1:]]
+    return joined_fit(current, base), sorted(near, key=lambda fit: -fit.log_evidence)
+
+
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:
     """Whether the best of the candidates is accepted, and what comes close to it."""
     best = near[0]
     gain = best.log_evidence - current.log_evidence
-    accepted = gain >= bench.settings.least_gain and min(best.by_seed) > current.log_evidence
+    agreed = sum(evidence > current.log_evidence for evidence in best.by_seed) >= 2
+    accepted = gain >= bench.settings.least_gain and agreed
     reason = f"gain {gain:.1f}"
     if accepted and gain < SURE:
         own, base = (held_out_scores(bench.question, fit) for fit in (best, current))

@@ -20,6 +20,10 @@ WORTH_FITTING = {True: -2.0, False: -25.0}
 the data as it is, and where it does not."""
 WITHIN = 15.0
 """Candidates whose gain is so close to the best get a second seed."""
+IMPROVED = 2.0
+"""Gain of the base model fitted again from which the best candidates are fitted again too."""
+CLOSER = 3
+"""Times the budget with which a candidate that neither wins nor loses clearly is fitted again."""
 AMBIGUOUS = 3.0
 SURE = 25.0
 """Gain from which blocks held out have no veto: their fits to fewer data are less sure than it."""

@@ -18,7 +18,7 @@ from test_noise import STD, episode_of, silent
 from tpcd.data.episode import write_episode
 from tpcd.data.header import Header, read_header
 from tpcd.data.measured import Measured, measured_contents
-from tpcd.discrepancy.checks import check_one_set_up, read_data
+from tpcd.discrepancy.checks import check_one_set_up, one_noise, read_data
 from tpcd.errors import EpisodeError
 
 
@@ -186,3 +186,25 @@ def test_noise_stated_much_too_small_is_one_line(
     code = call("diagnose", str(path), "--prior", PRIOR, "--out", str(tmp_path / "run"))
     error = capsys.readouterr().err.strip()
     assert code == 2 and "\n" not in error and "plainly too small" in error
+
+
+def test_measured_noise_may_differ_a_little(folder: Path) -> None:
+    known = read_header(folder / "a.yaml")
+    paths = (Path("a.yaml"), Path("b.yaml"))
+    assert known.sensor_std is not None
+    for factor, same in ((1.04, True), (1.9, True), (2.1, False)):
+        other = replace(known, sensor_std=tuple(factor * std for std in known.sensor_std))
+        if same:
+            check_one_set_up(paths, (known, other))
+        else:
+            with pytest.raises(EpisodeError, match="sensor_std"):
+                check_one_set_up(paths, (known, other))
+
+
+def test_episodes_of_different_noise_take_the_root_mean_square() -> None:
+    one = episode_of(0)
+    assert one_noise([one, one]) == ((one, one), ())
+    (first, second), (note,) = one_noise([one, replace(one, sensor_std=1.5 * one.sensor_std)])
+    expected = one.sensor_std * (0.5 * (1.0 + 1.5**2)) ** 0.5
+    assert torch.allclose(first.sensor_std, expected)
+    assert torch.equal(first.sensor_std, second.sensor_std) and "root mean square" in note

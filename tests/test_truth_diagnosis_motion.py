@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -195,3 +195,14 @@ def test_commands_stay_within_the_force_limit_whatever_is_measured():
         commands = np.vstack((commands, command.numpy()))
         poses = np.vstack((poses, command.numpy() + rng.normal(0, 0.02, 3)))
         wrenches = np.vstack((wrenches, rng.normal(0, 4, 3)))
+
+
+def test_a_hand_that_starts_tilted_turns_upright_and_finds_floor_and_wall():
+    scene = draw_scene("mug", OUTLINES["mug"].vertices, generator(0))
+    raised = scene.start_pose + torch.tensor([0.0, 0.02, 0.1], dtype=torch.float64)
+    scene = replace(scene, start_pose=raised)
+    motion = make_motion("diagnosis", scene, 20, generator(1))
+    recording = record(make_truth(scene, "quasistatic"), scene, motion, 20, generator(2))
+    touched = np.array([scene.clearances(pose) for pose in recording.true.poses]) < TOUCHING
+    assert touched[:, 0].sum() >= 5 and touched[:, 1].sum() >= 2
+    assert len(np.unique(recording.true.commands.numpy().round(4), axis=0)) > 15

@@ -219,8 +219,9 @@ def _field_documentation(config: type) -> dict[str, str]:
     """The line under each field; empty where the source is not at hand."""
     import docstring_parser
 
-    found = docstring_parser.parse_from_object(config)
-    return {entry.arg_name: entry.description or "" for entry in found.params}
+    parents = [kind for kind in reversed(config.__mro__) if dataclasses.is_dataclass(kind)]
+    found = [entry for kind in parents for entry in docstring_parser.parse_from_object(kind).params]
+    return {entry.arg_name: entry.description or "" for entry in found}
 
 
 def _underscored(argument: str) -> str:

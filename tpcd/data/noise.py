@@ -169,7 +169,7 @@ def check_noise(episode: Episode) -> list[str]:
         # A normal number is never likelier to come so near to anything, rounded or not.
         share = math.erf((NEAR + step / 2) / math.sqrt(2.0))
         by_share = binom.sf(near - 1, len(away), share) < SURE
-        least = max(ratio, step / math.sqrt(12.0))
+        least = max(_ratio(episode, k, alone=True)[0], step / math.sqrt(12.0))
         by_scatter = least < TOO_LARGE and chi2.cdf(least**2 * freedom, freedom) < SURE
         if by_share or by_scatter:
             found = (
@@ -200,13 +200,18 @@ def check_noise(episode: Episode) -> list[str]:
 _PAUSES, _PARITY = "rows of one command differ", "w - K (x - u) scatters"
 
 
-def _ratio(episode: Episode, channel: int) -> tuple[float, int, str]:
-    """Scatter of a channel over what is stated, its degrees of freedom, and where it shows."""
+def _ratio(episode: Episode, channel: int, alone: bool = False) -> tuple[float, int, str]:
+    """Scatter of a channel over what is stated, its degrees of freedom, and where it shows.
+
+    Parity holds the noise of pose and wrench, independent of each other; with `alone` that of the
+    wrench only, since an arm that makes its spring from the force sensor has them correlated.
+    """
     stated = episode.sensor_std.numpy()
     if channel >= 3:
         variance, freedom = _parity([episode])
         axis = channel - 3
-        expected = stated[channel] ** 2 + float(episode.stiffness[axis] * stated[axis]) ** 2
+        pose = 0.0 if alone else float(episode.stiffness[axis] * stated[axis])
+        expected = stated[channel] ** 2 + pose**2
         if freedom > CURVES and expected > 0:
             return math.sqrt(variance[axis] / expected), freedom, _PARITY
     squares, freedom = _pauses([episode])

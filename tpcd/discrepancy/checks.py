@@ -7,8 +7,10 @@ its answer here, since there is nothing to fit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import torch
 
 from tpcd.data.checks import check_episode
 from tpcd.data.episode import Episode, locate
@@ -18,6 +20,8 @@ from tpcd.data.noise import check_noise, read_noisy
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.errors import EpisodeError
 
+NOISE_FACTOR = 2.0
+"""Measured noise of one set-up may differ by less than this."""
 ONE_SET_UP = "episodes of one run must come from one set-up, so diagnose them apart"
 
 
@@ -51,13 +55,15 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
     told = [line for episode in episodes for line in check_noise(episode)]
     warnings = [line for episode in episodes for line in check_episode(episode)]
     count = len(paths)
-    return Data(tuple(episodes[:count]), tuple(episodes[count:]), (*notes, *told), tuple(warnings))
+    given, noted = one_noise(episodes[:count])
+    return Data(given, tuple(episodes[count:]), (*notes, *noted, *told), tuple(warnings))
 
 
 def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:
     """Refuse episodes whose YAMLs differ in what makes a set-up; raises `EpisodeError`.
 
-    Where one of them says nothing of noise, object or time step, it takes the others'.
+    Where one of them says nothing of noise, object or time step, it takes the others'. Noise that
+    was measured differs from one recording to the next, and may by a factor of `NOISE_FACTOR`.
     """
     for name in ("stiffness", "sensor_std", "object", "time_step_s", "priors"):
         first: tuple[Path, object] | None = None
@@ -67,12 +73,31 @@ def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:
                 continue
             if first is None:
                 first = path, value
-            elif value != first[1]:
+            elif not _same(name, value, first[1]):
                 raise EpisodeError(
                     path,
                     f"{name} is {_shown(value)}, but {_shown(first[1])} in {first[0]}",
                     ONE_SET_UP,
                 )
+
+
+def _same(name: str, value: object, other: object) -> bool:
+    if name != "sensor_std" or not (isinstance(value, tuple) and isinstance(other, tuple)):
+        return value == other
+    pairs = zip(value, other, strict=True)
+    return all(a == b or max(a, b) < NOISE_FACTOR * min(a, b) for a, b in pairs)
+
+
+def one_noise(episodes: Sequence[Episode]) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
+    """The episodes with one standard deviation for each channel, the root mean square of theirs,
+    and a note where they differ."""
+    stated = torch.stack([episode.sensor_std for episode in episodes])
+    if bool((stated == stated[0]).all()):
+        return tuple(episodes), ()
+    common = stated.square().mean(0).sqrt()
+    text = ", ".join(f"{value:.3g}" for value in common.tolist())
+    note = f"the episodes state different sensor_std; taken as [{text}], their root mean square"
+    return tuple(replace(episode, sensor_std=common) for episode in episodes), (note,)
 
 
 def _without_commands(table: Path, header: Header) -> Diagnosis:

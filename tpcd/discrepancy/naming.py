@@ -30,7 +30,7 @@ from tpcd.discrepancy.settings import (
     WORTH_FITTING,
     DiagnosisSettings,
 )
-from tpcd.discrepancy.variants import VARIANTS, Variant
+from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, Variant
 from tpcd.effects.protocol import Effect
 from tpcd.random import stream
 
@@ -144,11 +144,16 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     return _judged(bench, current, near, number)
 
 
-def better_base(bench: Workbench, current: Fit, rival: float) -> tuple[Variant, Question] | None:
+def better_base(
+    bench: Workbench, current: Fit, rival: Fit | None
+) -> tuple[Variant, Question] | None:
     """The variant of the base model that explains the data best, if it does so better than the
-    model as it is and the `rival` log evidence of the best candidate."""
+    model as it is and the `rival`, the best candidate."""
     found: list[tuple[float, Variant, Question]] = []
+    enough = rival is not None and bench.adequacy(rival).adequate(bench.settings.level)
     for variant in VARIANTS:
+        if enough and variant is FINER_STEPS:
+            continue  # slow, and nothing is left for it to explain
         question = variant.change(bench.question)
         try:
             fit = fit_model(question, current.effects, (0,), start=(current,))
@@ -159,7 +164,8 @@ def better_base(bench: Workbench, current: Fit, rival: float) -> tuple[Variant, 
         bench.candidates.append(Candidate(variant.name, 0, gain, fit.by_seed))
         found.append((fit.log_evidence, variant, question))
     evidence, variant, question = max(found, key=lambda one: one[0], default=(-math.inf,) * 3)
-    least = max(current.log_evidence, rival) + bench.settings.least_gain
+    reached = [current.log_evidence, *([] if rival is None else [rival.log_evidence])]
+    least = max(reached) + bench.settings.least_gain
     if evidence < least:
         return None
     return variant, question

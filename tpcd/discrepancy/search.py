@@ -158,8 +158,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
 def _changed_base(bench: Workbench, found: Round) -> tuple[Variant, Fit] | None:
     """Another base model where one explains the data better than any effect, fitted well; what
     is asked from then on is asked of it."""
-    rival = -float("inf") if found.best is None else found.best.log_evidence
-    better = better_base(bench, found.base, rival)
+    better = better_base(bench, found.base, found.best)
     if better is None:
         return None
     variant, bench.question = better

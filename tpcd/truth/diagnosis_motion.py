@@ -249,12 +249,12 @@ def _follow(history: History, moves: Sequence[Move]) -> Generator[Command, Histo
 
 
 def _descend(history: History) -> Generator[Command, History, History]:
-    """Lower the command until the floor holds the hand back."""
-    x, z, angle = as_command(history.commands[-1])
+    """Lower the command, upright, until the floor holds the hand back."""
+    x, z, _ = as_command(history.commands[-1])
     felt = feel(history)
     while not felt.on_floor:
         z -= min(SEARCH_STEP_DOWN, 3.0 / felt.stiffness[1])
-        history = yield (x, z, angle)
+        history = yield (x, z, 0.0)
         felt = feel(history)
     return history
 

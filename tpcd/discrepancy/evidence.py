@@ -115,10 +115,11 @@ def fit_model(
     seeds: Sequence[int],
     start: Sequence[Fit] = (),
     step: StepSettings | None = None,
+    places: Float[Tensor, "k s"] | None = None,
 ) -> Fit:
     """Fit the base model with these effects; seeds are told apart by their numbers.
 
-    Besides the prior, a fit also starts from where those in `start` arrived.
+    Besides the prior, a fit also starts from where those in `start` arrived, and from `places`.
     """
     effects = tuple(effects)
     prior = question.scene.with_effects(effects)
@@ -132,9 +133,9 @@ def fit_model(
         generator = fit_stream(question, effects, seed)
 
         def work(generator: torch.Generator = generator) -> Cloud:
-            return _fitted(target, question.sampler, start, generator)
+            return _fitted(target, question.sampler, start, places, generator)
 
-        clouds.append(question.memory.recall((*model, begun, seed), Cloud, work))
+        clouds.append(question.memory.recall((*model, begun, places, seed), Cloud, work))
     return Fit(effects, step, prior, tuple(c.log_evidence for c in clouds), tuple(clouds))
 
 
@@ -142,12 +143,15 @@ def _fitted(
     target: ContactTarget,
     sampler: SamplerSettings,
     start: Sequence[Fit],
+    places: Float[Tensor, "k s"] | None,
     generator: torch.Generator,
 ) -> Cloud:
     """The particles of one seed."""
     begin = start_cloud(target.sample(sampler.particles, generator))
     remembered = [carried(fit, target.prior, generator) for fit in start]
     remembered.append(_early_modes(target, sampler, generator))
+    if places is not None:
+        remembered.append(places)
     begin = replace(begin, modes=torch.cat(remembered))
     pool = draw_pool(begin, target, 1, sampler, generator)
     weights = truncate(known_weights(pool.log_weights))

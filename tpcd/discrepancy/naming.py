@@ -107,9 +107,11 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
         bench.glances.extend(glances)
     worth = current.log_evidence + WORTH_FITTING[adequate]
     chosen = [g.effect for g in glances[: settings.full_fits] if g.log_evidence > worth]
+    places = {g.effect.name: g.place[None] for g in glances}
 
     def fitted(effect: Effect, seed: int) -> Fit:
-        return fit_model(question, (*current.effects, effect), (seed,), start=(current,))
+        effects, found = (*current.effects, effect), places[effect.name]
+        return fit_model(question, effects, (seed,), start=(current,), places=found)
 
     fits = _each(bench, chosen, number, lambda effect: fitted(effect, 0))
     top = max((fit.log_evidence for fit in fits), default=-math.inf)

@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from tpcd.belief.modes import climb
 from tpcd.belief.prior import ParameterPrior
@@ -19,7 +21,8 @@ from tpcd.discrepancy.evidence import Fit, Question, carried, fit_stream
 from tpcd.effects.protocol import Effect
 
 PLACES = 8
-"""Places of the base fit from which points climb."""
+"""Places of the base fit from which points climb, for an effect of one parameter."""
+MOST_PLACES = 48
 ROUNDS = 4
 FRESH_ROUNDS = 2
 KEPT = 6
@@ -35,6 +38,8 @@ class Glance:
     """By Laplace's approximation at the best mode found."""
     sd: tuple[float, ...]
     """Standard deviation there of each parameter of the effect, in SI units."""
+    place: Float[Tensor, " s"]
+    """The mode, in unconstrained coordinates."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,7 @@ class _Peak:
 
     log_evidence: float
     sd: tuple[float, ...]
+    place: Float[Tensor, " s"]
 
 
 def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
@@ -53,14 +59,16 @@ def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
     prior = question.scene.with_effects(effects)
     key = (question.fingerprint, names, prior.low, prior.high, base.fingerprint, fresh)
     found = question.memory.recall(key, _Peak, lambda: _peak(question, base, prior, fresh))
-    return Glance(effect, found.log_evidence, found.sd)
+    return Glance(effect, found.log_evidence, found.sd, found.place)
 
 
 def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _Peak:
     effects = prior.effects
     target = ContactTarget(prior, question.misfit, base.step, question.history)
     generator = fit_stream(question, effects, 0)
-    start = carried(base, prior, generator, PLACES)
+    # Two parameters, such as how high a step is and where, are rarely right by chance together.
+    count = min(PLACES * len(effects[-1].parameters) ** 2, MOST_PLACES)
+    start = carried(base, prior, generator, count)
     if fresh:
         begun, height = climb(target, target.scatter(fresh, generator), FRESH_ROUNDS)
         best = height.topk(min(KEPT, fresh)).indices
@@ -75,4 +83,4 @@ def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _
     vector, slope = prior.to_vector_with_slope(points[best[top]][:-1])
     own = slice(len(vector) - len(effects[-1].parameters), len(vector))
     sd = covariance.diagonal()[:-1].sqrt() * slope
-    return _Peak(float(each[top]), tuple(sd[own].tolist()))
+    return _Peak(float(each[top]), tuple(sd[own].tolist()), points[best[top]])

@@ -124,7 +124,8 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         while len(current.effects) - bench.given < settings.most_effects:
             first = len(current.effects) == bench.given
             found = name_one(bench, current, pool, bench.adequacy(current).adequate(0.05))
-            if first and not variants and not _explains(bench, found.base):
+            untried = first and pool is settings.catalogue and not variants
+            if untried and not _explains(bench, found.base):
                 changed = _changed_base(bench, found)
                 if changed is not None:
                     variant, base = changed

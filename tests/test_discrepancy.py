@@ -16,12 +16,15 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.adequacy import free_space_score, parity_score
+from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
+from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
+from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import Question, fit_model
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
 from tpcd.discrepancy.memory import Memory
+from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.report_parts import shown_value
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.effects import find_effect
@@ -139,6 +142,29 @@ def test_a_diagnosis_that_was_stopped_goes_on_with_the_fits_it_had(
     kept[0].write_bytes(b"half")
     with pytest.raises(RunError, match="cannot be read"):
         diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
+
+
+@pytest.mark.parametrize("share, named", [(0.2, False), (math.nan, False), (0.8, True)])
+def test_where_something_is_left_effects_must_close_half_of_the_gap(
+    share: float, named: bool, shape: PolygonShape, clean: Episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(SMALL, sampler=replace(SMALL.sampler, draws=200, fresh_modes=8))
+    question = Question(
+        joined_history([clean]), make_prior(shape), MisfitField(1e-4), StepSettings(),
+        settings.sampler,
+    )  # fmt: skip
+    bench = Workbench(question, settings, coverage_of([clean]), 0, lambda line: None)
+    base = fit_model(question, (), (0,))
+    final = fit_model(question, (find_effect("floor_tilt"),), (0,), start=(base,))
+    cell = Cell("all", "z", "mean", 2.0, 30)
+    left = Adequacy(0.3, 1e-9, 0.5, (cell,))
+    monkeypatch.setattr("tpcd.discrepancy.conclude._gap", lambda *_: ((), share))
+    monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: left)
+    found = conclude(bench, Findings(base, final, left, left), [clean], ())
+    assert found.verdict == "unknown_remains"
+    assert found.names == (("floor_tilt",) if named else ())
+    assert found.belief is not None and found.belief.prior.effects == final.effects[: int(named)]
+    assert any("not named" in note for note in found.notes) != named
 
 
 def test_a_short_episode_is_not_enough(shape: PolygonShape, clean: Episode) -> None:

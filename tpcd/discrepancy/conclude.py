@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tpcd.belief.belief import Belief
 from tpcd.data.episode import Episode
@@ -17,6 +17,9 @@ from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.variants import NUMERICS, Variant
 from tpcd.random import stream
+
+HALF = 0.5
+"""Share of the gap that effects must close to be named where something else is left."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +41,19 @@ def conclude(
 ) -> Diagnosis:
     """The verdict, its effects, and the gap before and after."""
     settings, question = bench.settings, bench.question
+    gap: tuple[Gap, ...] = ()
+    share = math.nan
+    if found.final is not found.base:
+        gap, share = _gap(bench, found, episodes, fresh)
+        left = settings.adequacy and not found.after.adequate(settings.level)
+        if left and not share >= HALF:
+            found, gap, share = _without_effects(bench, found, share), (), math.nan
     belief, first = (posterior(question, fit) for fit in (found.final, found.base))
     effects = (
         *(NamedEffect("numerics", (), v.note) for v in found.variants if v.name in NUMERICS),
         *named_effects(belief, bench.given),
     )
     verdict, sentence = _verdict(bench, found, effects)
-    gap: tuple[Gap, ...] = ()
-    share = math.nan
-    if found.final is not found.base:
-        gap, share = _gap(bench, found, episodes, fresh)
     shape = _shape_line(belief, found.variants)
     bench.tell(f"shape: {shape}")
     bench.tell(f"verdict: {verdict.replace('_', ' ')}: {sentence}")
@@ -79,6 +85,16 @@ def conclude(
         belief=belief,
         belief_before=first,
     )
+
+
+def _without_effects(bench: Workbench, found: Findings, share: float) -> Findings:
+    """The model without effects that leave something and close less than half of the gap: what is
+    missing is something else, of which they take a part."""
+    names = " and ".join(found.final.names[bench.given :])
+    part = f"{share:.0%} of the gap" if math.isfinite(share) else "no gap that can be told"
+    bench.notes.append(f"{names} would close {part} while something is left, so it is not named")
+    bench.tell(bench.notes[-1])
+    return replace(found, final=found.base, after=bench.adequacy(found.base), close=())
 
 
 def _verdict(

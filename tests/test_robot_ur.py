@@ -192,7 +192,9 @@ def test_a_stopped_run_goes_on_and_a_slipped_object_does_not(emulator, tmp_path:
     slipped.poses[0] = episode.poses[0]
     third = arm_on(emulator, tmp_path)
     try:
-        with pytest.raises(RobotError, match="repeating move 1 ends 4.* the object has slipped"):
+        with pytest.raises(
+            RobotError, match=r"repeating move 1 ends [345]\.\d mm.* the object has slipped"
+        ):
             third.resume(slipped)
         assert third.at_rest == "the arm has retreated"
     finally:
@@ -242,7 +244,10 @@ def test_a_lost_link_is_noticed_at_once_though_the_client_serves_the_last_pose(
 
 @pytest.mark.parametrize(
     ("fault", "said"),
-    [("wrong_payload", "payload is wrong by about 0.[78]"), ("drifting_sensor", "drifts by 0.6")],
+    [
+        ("wrong_payload", "payload is wrong by about 0.[78]"),
+        ("drifting_sensor", r"drifts by 0\.[56]"),
+    ],
 )
 def test_a_sensor_that_zeroing_does_not_mend_is_refused(
     fault: str, said: str, tmp_path: Path

@@ -25,6 +25,7 @@ from tpcd.discrepancy.settings import (
     FRESH,
     IMPROVED,
     SURE,
+    UNDECIDED,
     VETO_LEVEL,
     WITHIN,
     WORTH_FITTING,
@@ -134,7 +135,8 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
                 for fit in near[:2]
             ]
             near.sort(key=lambda fit: -fit.log_evidence)
-    if near and -SURE < near[0].log_evidence - current.log_evidence < SURE:
+    lead = near[0].log_evidence - current.log_evidence if near else -math.inf
+    if UNDECIDED[adequate] < lead < SURE:
         current, near = _looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)

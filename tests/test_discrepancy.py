@@ -19,7 +19,7 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.confusion import confusions, signatures
-from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
+from tpcd.discrepancy.coverage import MOTIONS, NEEDED, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import Question, fit_model
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
@@ -264,6 +264,21 @@ def test_press_and_slide_hardly_tell_gain_from_stiffness(shape: PolygonShape) ->
         span = torch.linalg.qr(other.T).Q
         alike.append(float((span.T @ own[0]).norm() / own[0].norm()))
     assert alike[1] > alike[0] + 0.03
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.85])
+def test_contact_is_read_from_the_impedance_alone(friction: float) -> None:
+    generator = torch.Generator().manual_seed(8)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    scene = replace(scene, friction=friction)
+    motion = make_motion("diagnosis", scene, 60, generator)
+    rows = record(make_truth(scene, "quasistatic"), scene, motion, 60, generator)
+    gaps = torch.tensor([scene.clearances(pose) for pose in rows.true.poses])
+    for found, true in zip(contact_rows(rows.measured), (gaps < 1e-4).T, strict=True):
+        # Friction of the wall pushes up without being the floor; light touches are not seen.
+        assert int((found & ~true).sum()) <= 1
+        assert int((found & true).sum()) > 0.7 * int(true.sum())
+    assert not coverage_of([rows.measured]).missing(("wall slip", "floor slip"))
 
 
 def test_gaps_and_bounds_of_numbers_known_by_hand() -> None:

@@ -18,6 +18,8 @@ from tpcd.truth.motions import LARGEST_FRICTION, TOUCH_FORCE
 
 MOVED = 0.005
 """A row that moved further than this along a surface slid on it [m]."""
+LEVEL = 0.004
+"""A hand this much higher than wherever the floor held it does not touch it [m]."""
 STILL = 0.001
 """A row that moved less than this stuck to it [m]."""
 NEEDED: dict[str, float] = {
@@ -77,11 +79,18 @@ def coverage_of(episodes: Sequence[Episode]) -> Coverage:
 
 
 def contact_rows(episode: Episode) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Rows in contact with the floor, and with the wall."""
-    force = _force(episode)
-    floored = force[:, 1] > TOUCH_FORCE / 2
-    walled = -force[:, 0] > LARGEST_FRICTION * force[:, 1].clamp_min(0.0) + TOUCH_FORCE / 2
-    return floored, walled
+    """Rows in contact with the floor, and with the wall.
+
+    A force up and within the floor's friction cone is the floor, which says how high it is. A
+    force up from higher than that is friction of the wall.
+    """
+    force, height = _force(episode), episode.poses[:, 1]
+    up = force[:, 1] > TOUCH_FORCE / 2
+    floor_alone = up & (force[:, 0].abs() <= LARGEST_FRICTION * force[:, 1])
+    if bool(floor_alone.any()):
+        up &= height <= height[floor_alone].max() + LEVEL
+    drag = torch.where(up, LARGEST_FRICTION * force[:, 1], 0.0)
+    return up, -force[:, 0] > drag + TOUCH_FORCE / 2
 
 
 def _of_one(episode: Episode) -> dict[str, float]:

@@ -250,17 +250,17 @@ def _found(
     out = folder / "diagnosis"
     if not (out / "verdict.json").is_file():
         arguments = [str(folder / "diagnosis.csv"), "--fresh", str(folder / "test.csv")]
+        script = Path(__file__).parents[1] / "scripts" / "diagnose.py"
         subprocess.run(
-            [sys.executable, "scripts/diagnose.py", *arguments, "--prior", config.prior]
+            [sys.executable, str(script), *arguments, "--prior", config.prior]
             + ["--out", str(out), "--seed", str(config.seed), "--overwrite"],
             check=False,
         )
     if not (out / "verdict.json").is_file():
         return None, "the diagnosis failed"
     verdict = json.loads((out / "verdict.json").read_text(encoding="utf-8"))
-    text = str(verdict.get("verdict", verdict.get("kind", "")))
     path = out / "model.yaml"
-    return (load_model(path) if path.is_file() else None), text
+    return (load_model(path) if path.is_file() else None), verdict["verdict"]
 
 
 def _row(name: str, tiles: float, estimator: str, belief: Belief, test: Episode) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     fits = _each(bench, chosen, number, lambda effect: fitted(effect, 0))
     top = max((fit.log_evidence for fit in fits), default=-math.inf)
     near = [
-        joined_fit(fit, fitted(fit.effects[-1], 1))
+        _again(bench, fit, lambda fit: fitted(fit.effects[-1], 1))
         if fit.log_evidence > current.log_evidence
         else fit
         for fit in fits
@@ -125,13 +125,15 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     ]
     near.sort(key=lambda fit: -fit.log_evidence)
     if settings.base_refit and near:
-        again = fit_model(question, current.effects, (10,), start=(current, *near[:2]))
-        better = again.log_evidence > current.log_evidence + IMPROVED
-        current = joined_fit(current, again)
+        start = (current, *near[:2])
+        base = _again(bench, current, lambda fit: fit_model(question, fit.effects, (10,), start))
+        found = base.by_seed[len(current.by_seed) :]
+        better = max(found, default=-math.inf) > current.log_evidence + IMPROVED
+        current = base
         if better:
             # What the base model has learnt from the alternatives, they may learn from it.
             near = [
-                joined_fit(fit, fit_model(question, fit.effects, (11,), start=(current, fit)))
+                _again(bench, fit, lambda fit: fit_model(question, fit.effects, (11,), (base, fit)))
                 for fit in near[:2]
             ]
             near.sort(key=lambda fit: -fit.log_evidence)
@@ -167,12 +169,11 @@ def better_base(
         gain = fit.log_evidence - current.log_evidence
         bench.candidates.append(Candidate(variant.name, 0, gain, fit.by_seed))
         found.append((fit.log_evidence, variant, question))
-    evidence, variant, question = max(found, key=lambda one: one[0], default=(-math.inf,) * 3)
-    reached = [current.log_evidence, *([] if rival is None else [rival.log_evidence])]
-    least = max(reached) + bench.settings.least_gain
-    if evidence < least:
+    if not found:
         return None
-    return variant, question
+    evidence, variant, question = max(found, key=lambda one: one[0])
+    reached = [current.log_evidence, *([] if rival is None else [rival.log_evidence])]
+    return (variant, question) if evidence >= max(reached) + bench.settings.least_gain else None
 
 
 def pruned(bench: Workbench, fit: Fit) -> Fit:
@@ -213,10 +214,11 @@ def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit
             sampler, fresh_modes=CLOSER * sampler.fresh_modes, draws=CLOSER * sampler.draws
         ),
     )
-    base = fit_model(wide, current.effects, (30,), start=(current, near[0]))
-    best = fit_model(wide, near[0].effects, (30,), start=(current, near[0]))
-    near = [joined_fit(near[0], best), *near[1:]]
-    return joined_fit(current, base), sorted(near, key=lambda fit: -fit.log_evidence)
+    start = (current, near[0])
+    base, best = (
+        _again(bench, fit, lambda fit: fit_model(wide, fit.effects, (30,), start)) for fit in start
+    )
+    return base, sorted((best, *near[1:]), key=lambda fit: -fit.log_evidence)
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:
@@ -248,6 +250,16 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
         if fit.log_evidence > best.log_evidence - AMBIGUOUS
     )
     return Round(current, best if accepted else None, close)
+
+
+def _again(bench: Workbench, fit: Fit, work: Callable[[Fit], Fit]) -> Fit:
+    """A fit joined with another one of its model; where that one fails, the fit as it is."""
+    try:
+        return joined_fit(fit, work(fit))
+    except Exception as error:
+        model = ", ".join(fit.names) or "the base model"
+        bench.warn(f"{model} failed when fitted again: {type(error).__name__}: {error}")
+        return fit
 
 
 def _each(

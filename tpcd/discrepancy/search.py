@@ -117,7 +117,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     base = current = fit_well(bench, effects)
     before = bench.adequacy(base)
     find_confusions(bench, base)
-    tell_adequacy(bench, "the model as it is", before)
+    _tell_adequacy(bench, "the model as it is", before)
     variants: list[Variant] = []
     close = ()
     for pool in (settings.catalogue, FORMULAS):
@@ -131,7 +131,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
                     variant, base = changed
                     current = base
                     variants.append(variant)
-                    tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
+                    _tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
                     continue
             current = found.base
             if first:
@@ -146,7 +146,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         more = fit_model(bench.question, current.effects, FINAL_SEEDS, start=(current,))
         current = joined_fit(current, more)
     after = bench.adequacy(current)
-    tell_adequacy(bench, "the model found", after)
+    _tell_adequacy(bench, "the model found", after)
     halving = step_halving(bench.question, current)
     bench.notes.append(
         f"numerics: with {FINER} times the substeps 95 % of the predictions change by less than"
@@ -173,7 +173,7 @@ def _explains(bench: Workbench, fit: Fit) -> bool:
     return not bench.settings.adequacy or bench.adequacy(fit).adequate(bench.settings.level)
 
 
-def tell_adequacy(bench: Workbench, what: str, found: Adequacy) -> None:
+def _tell_adequacy(bench: Workbench, what: str, found: Adequacy) -> None:
     """A line on what a model leaves."""
     word = "explains the data" if found.adequate(bench.settings.level) else "leaves something"
     top = found.cells[0] if found.cells else None

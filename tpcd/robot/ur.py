@@ -346,17 +346,22 @@ class UniversalRobot:
         settings, here = self.settings, self._state.reference
         self._over = -(10**6)  # The limit may be exceeded still: the ramp looks to the force.
         left = -1.0 if float(self._state.wrench[0]) < -1.0 else 0.0
-        for way in (np.array([left, 1.0, 0.0]), np.array([0.0, 1.0, 0.0])):
-            goal = here + 0.5 * settings.retreat * way
-            low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
-            goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
-            self._ramp_to(goal, RETREAT_FORCE)
-            here = self._state.reference
-        self._over = 0
+        low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
+        try:
+            for way in (np.array([left, 1.0, 0.0]), np.array([0.0, 1.0, 0.0])):
+                goal = here + 0.5 * settings.retreat * way
+                goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
+                self._ramp_to(goal, RETREAT_FORCE)
+                here = self._state.reference
+        finally:
+            self._over = 0
 
     @contextmanager
     def _watched(self, name: str, **about: object) -> Iterator[None]:
-        """Record a move however it ends, and bring the arm to rest if it ends badly."""
+        """Record a move however it ends, and bring the arm to rest if it ends badly; a stopped arm
+        is not moved again."""
+        if self.at_rest is not None:
+            raise RobotError(f"{self.at_rest} since it was stopped; connect anew to move it")
         about = {"row": self._row, **about}
         try:
             yield

@@ -33,8 +33,12 @@ def checked_modules() -> list[str]:
 jaxtyping.install_import_hook(checked_modules(), "beartype.beartype")
 
 import torch  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 torch.set_num_threads(1)
+# How long an example takes says nothing of the code: first calls import and compile.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 
 @dataclass(frozen=True)

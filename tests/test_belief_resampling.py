@@ -22,7 +22,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.floats(-700, 700) | st.just(-math.inf), min_size=1, max_size=30).filter(
         lambda values: max(values) > -math.inf

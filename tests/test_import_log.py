@@ -47,7 +47,7 @@ TURNED = Setting(
 )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     base=angles,
     tool=angles,

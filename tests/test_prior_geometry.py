@@ -49,7 +49,7 @@ def test_half_of_the_points_of_a_box_sit_at_its_corners() -> None:
     assert (to_corner < 0.008).mean() == pytest.approx(0.5 + 0.5 * 0.064 / 0.6, abs=0.05)
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(shift=st.integers(0, 299))
 def test_where_an_outline_starts_does_not_matter(shift: int) -> None:
     known = builtin_outlines()

@@ -122,7 +122,7 @@ def test_far_rows_and_zero_rows_change_nothing(engine):
     torch.testing.assert_close(solve(wide, engine).motion, solve(problem, engine).motion)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), rows=st.sampled_from([4, 8, 14]))
 def test_the_order_of_rows_does_not_matter(engine, seed, rows):
     problem = random_contact_problems(30, rows, seed)
@@ -139,7 +139,7 @@ def test_the_order_of_rows_does_not_matter(engine, seed, rows):
     assert torch.equal(first.status, second.status)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), decades=st.tuples(*[st.floats(-4, 4)] * 3))
 def test_units_do_not_matter(engine, seed, decades):
     length, force, row = (10.0**decade for decade in decades)

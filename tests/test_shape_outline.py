@@ -45,7 +45,7 @@ def segment_distance(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 @given(stars)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_area_centroid_is_the_origin_and_the_order_counter_clockwise(vertices):
     outline = make_outline("star", vertices)
     x, z = outline.vertices.T
@@ -57,7 +57,7 @@ def test_the_area_centroid_is_the_origin_and_the_order_counter_clockwise(vertice
 
 
 @given(stars, st.integers(0, 39), st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_where_the_vertex_list_starts_and_runs_changes_no_distance(vertices, shift, flip):
     other = np.roll(vertices, shift, axis=0)
     other = other[::-1] if flip else other
@@ -100,7 +100,7 @@ def test_distance_is_negative_inside_and_positive_outside(name):
 
 
 @given(stars)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_support_is_the_largest_projection_of_any_vertex(vertices):
     outline = make_outline("star", vertices)
     angle = np.linspace(0, 2 * np.pi, 37)
@@ -110,7 +110,7 @@ def test_support_is_the_largest_projection_of_any_vertex(vertices):
 
 
 @given(stars)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_hull_is_convex_and_made_of_vertices(vertices):
     outline = make_outline("star", vertices)
     corners = hull(outline)
@@ -121,7 +121,7 @@ def test_the_hull_is_convex_and_made_of_vertices(vertices):
 
 
 @given(stars, st.integers(3, 200), st.floats(0, 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_resampled_points_lie_on_the_polygon_and_are_distinct(vertices, count, weight):
     outline = make_outline("star", vertices)
     points = resample(outline, count, weight)
@@ -145,7 +145,7 @@ def test_resampling_by_turning_puts_a_quarter_of_the_points_at_each_corner_of_a_
 
 
 @given(stars)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_turning_angles_sum_to_one_turn(vertices):
     assert turning_angles(make_outline("star", vertices)).sum() == pytest.approx(2 * np.pi)
 

@@ -88,7 +88,7 @@ def test_relative_commands_after_close_go_on_from_the_start_of_the_subpath():
     st.floats(-50, 50),
     st.floats(1, 50),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_arcs_lie_on_an_ellipse_of_the_given_shape(rx, ry, degrees, large, sweep, x, y):
     """Mapped to circles, all points keep one distance from one centre, the ends are met."""
     start, end = np.zeros(2), np.array([x, y])

@@ -15,21 +15,22 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from tpcd.simulator.kernel import (
+from tpcd.belief import kernel_filter
+from tpcd.belief.kernel_filter import assimilate, begin, follow, new_filter, pass_over
+from tpcd.simulator.kernel import source_stamp
+from tpcd.simulator.kernel_element import step_element
+from tpcd.simulator.kernel_geometry import World, new_chains
+from tpcd.simulator.kernel_request import (
     Answer,
     Request,
     new_planes,
     own_law,
     prepare,
     set_stiffness,
-    source_stamp,
-    step_element,
 )
-from tpcd.simulator.kernel_geometry import World, new_chains
-from tpcd.simulator.kernel_settle import JAMMED, RELAXED, new_space
+from tpcd.simulator.kernel_settle import JAMMED
 from tpcd.simulator.kernel_slopes import new_slopes
-
-_LOG_2PI = math.log(2.0 * math.pi)
+from tpcd.simulator.kernel_space import new_space
 
 
 class Measured(NamedTuple):
@@ -90,21 +91,6 @@ class Found(NamedTuple):
     contacts: np.ndarray
 
 
-class Filter(NamedTuple):
-    """The state of one particle's filter and what one transition needs; s = c + 3.
-
-    `by_theta` (d, s) are the derivatives of the mean.
-    """
-
-    mean: np.ndarray
-    covariance: np.ndarray
-    design: np.ndarray
-    cross: np.ndarray
-    factor: np.ndarray
-    innovation: np.ndarray
-    by_theta: np.ndarray
-
-
 def _compile_explain_range(stamp: int) -> Callable[..., None]:
     """The entry, the only function kept in numba's cache; `stamp` makes part of its key."""
 
@@ -137,15 +123,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         np.zeros((steps, terrains, 3)),
         np.zeros((steps, terrains, 4)),
     )
-    state = Filter(
-        np.zeros(size + 3),
-        np.zeros((size + 3, size + 3)),
-        np.zeros((3, size + 3)),
-        np.zeros((size + 3, 3)),
-        np.zeros((3, 3)),
-        np.zeros(3),
-        np.zeros((entries, size + 3)),
-    )
+    state = new_filter(size, entries)
     # Each particle starts its transitions at poses of its own.
     starts, previous, commands = (
         np.zeros((steps, 3)), np.zeros((steps, 3)), np.zeros((steps, 3))
@@ -183,11 +161,11 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         here = World(points[i : i + 1], normals, offsets, friction)
         _meet(here, given, i, 0)
         extent = prepare(here, 0, law, request, 0, steps, chains)
-        _begin(state, measured, seen, measured.sd[i])
+        begin(state, measured, seen, measured.sd[i])
         total = 0.0
         for k in range(steps):
             if not measured.used[k]:
-                _part(state, measured, seen, k, size)
+                pass_over(state, measured, seen, k, size)
                 continue
             _meet(here, given, i, k + 1)
             set_stiffness(law, given.stiffness[firm, k + 1 if given.stiffness.shape[1] > 1 else 0])
@@ -204,12 +182,12 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                 break
             if found.poses.shape[0] > 0:
                 _keep(found, answer, i, k)
-            total += _assimilate(state, measured, answer, seen, k, measured.sd[i])
+            total += assimilate(state, measured, answer, seen, k, measured.sd[i])
             if found.whitened.shape[0] > 0 and math.isfinite(total):
                 for a in range(3):
                     found.whitened[i, k, a] = state.innovation[a]
                     found.log_scale[i, k, a] = math.log(state.factor[a, a])
-                _follow(state, slopes.theta, found.slopes, i, k, size)
+                follow(state, slopes.theta, found.slopes, i, k, size)
             if not (total + measured.rest[seen, k] >= measured.least[i] and math.isfinite(total)):
                 total = -np.inf
                 break
@@ -255,187 +233,7 @@ def _keep(found, answer, i, k):
             found.contacts[i, k, t, a] = answer.contacts[k, t, a]
 
 
-@njit(_nrt=False)
-@no_type_check
-def _part(state, measured, seen, k, size):
-    """Pass over transition k: what is known of the next pose is its reading alone."""
-    for a in range(3):
-        state.mean[size + a] = 0.0
-        for r in range(size + 3):
-            state.covariance[size + a, r] = state.covariance[r, size + a] = 0.0
-        state.covariance[size + a, size + a] = measured.variance[seen, k + 1, a]
-    for e in range(state.by_theta.shape[0]):
-        for a in range(3):
-            state.by_theta[e, size + a] = 0.0
-
-
-@njit(_nrt=False)
-@no_type_check
-def _begin(state, measured, seen, sd):
-    """The state before any transition."""
-    width = state.mean.shape[0]
-    state.by_theta[:] = 0.0
-    for a in range(width):
-        state.mean[a] = 0.0
-        for b in range(width):
-            state.covariance[a, b] = 0.0
-        own = a - width + 3
-        state.covariance[a, a] = sd * sd if own < 0 else measured.variance[seen, 0, own]
-
-
-@njit(error_model="numpy", _nrt=False)
-@no_type_check
-def _assimilate(state, measured, answer, seen, k, sd):
-    """Filter the residual of transition k; returns its log density, -inf where it has none."""
-    mean, covariance, design = state.mean, state.covariance, state.design
-    cross, factor, innovation = state.cross, state.factor, state.innovation
-    width = mean.shape[0]
-    size, variance = width - 3, measured.variance
-    total = 0.0
-    for a in range(3):
-        innovation[a] = (
-            measured.poses[seen, k + 1, a] - measured.shift[seen, k + 1, a] - answer.poses[k, a]
-        )
-        total += innovation[a]
-    if answer.statuses[k] > RELAXED or not math.isfinite(total):
-        return -np.inf
-    innovation[2] = math.pi - (math.pi - innovation[2]) % (2.0 * math.pi)
-    _fill_design(design, measured, answer, k, size)
-    for s in range(width):
-        for a in range(3):
-            value = 0.0
-            for r in range(width):
-                value += covariance[s, r] * design[a, r]
-            cross[s, a] = value
-    uncovered = 1.0
-    for j in range(measured.bumps.shape[1]):
-        uncovered -= measured.bumps[k, j] ** 2
-    uncovered = max(uncovered, 0.0) * sd * sd if size > 0 else 0.0
-    for a in range(3):
-        for r in range(size):
-            innovation[a] -= design[a, r] * mean[r]
-        for b in range(a + 1):
-            value = variance[seen, k + 1, a] if a == b else 0.0
-            for t in range(answer.from_gap.shape[1]):
-                value += uncovered * answer.from_gap[k, t, a] * answer.from_gap[k, t, b]
-            for r in range(width):
-                value += design[a, r] * cross[r, b]
-            factor[a, b] = value
-    log_determinant = _factorise(factor)
-    _forward(factor, innovation)
-    square = innovation[0] ** 2 + innovation[1] ** 2 + innovation[2] ** 2
-    if square > measured.limit:
-        # Growing the covariance by a number stretches its factor by the root.
-        growth = square / measured.limit
-        root = math.sqrt(growth)
-        for a in range(3):
-            innovation[a] /= root
-            for b in range(a + 1):
-                factor[a, b] *= root
-        log_determinant += 3.0 * math.log(growth)
-        square = measured.limit
-    _advance(state, variance, seen, k, size)
-    return -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
-
-
-@njit(_nrt=False)
-@no_type_check
-def _fill_design(design, measured, answer, k, size):
-    """How the residual of transition k answers the field's coefficients and the start's error."""
-    bumps = measured.bumps.shape[1]
-    for a in range(3):
-        for t in range(answer.from_gap.shape[1]):
-            gap, lever = answer.from_gap[k, t, a], answer.from_lever[k, t, a]
-            for j in range(bumps):
-                design[a, t * bumps + j] = (
-                    gap * measured.bumps[k, j] + lever * measured.slopes[k, j]
-                )
-        for b in range(3):
-            design[a, size + b] = -answer.from_start[k, a, b]
-
-
-@njit(_nrt=False)
-@no_type_check
-def _advance(state, variance, seen, k, size):
-    """The state after a transition, from the whitened innovation and the cross covariance.
-
-    The field goes on; the error of this pose takes the place of the error of the last one.
-    """
-    mean, covariance, gain = state.mean, state.covariance, state.cross
-    for a in range(3):
-        mean[size + a] = 0.0
-        for r in range(size + 3):
-            covariance[size + a, r] = covariance[r, size + a] = 0.0
-        for b in range(3):
-            gain[size + a, b] = variance[seen, k + 1, a] if a == b else 0.0
-        covariance[size + a, size + a] = variance[seen, k + 1, a]
-    for r in range(size + 3):
-        for a in range(3):
-            for b in range(a):
-                gain[r, a] -= state.factor[a, b] * gain[r, b]
-            gain[r, a] /= state.factor[a, a]
-            mean[r] += gain[r, a] * state.innovation[a]
-    for r in range(size + 3):
-        for s in range(r + 1):
-            value = covariance[r, s]
-            for a in range(3):
-                value -= gain[r, a] * gain[s, a]
-            covariance[r, s] = covariance[s, r] = value
-
-
-@njit(_nrt=False)
-@no_type_check
-def _follow(state, theta, slopes, i, k, size):
-    """Derivatives of the innovation and of the mean by theta, at a fixed gain (Gauss-Newton).
-
-    `theta` are those of the settled pose from a given start; after `_assimilate`.
-    """
-    by_theta, factor, gain = state.by_theta, state.factor, state.cross
-    for e in range(theta.shape[0]):
-        for a in range(3):
-            value = -theta[e, a]
-            for r in range(size + 3):
-                value -= state.design[a, r] * by_theta[e, r]
-            for b in range(a):
-                value -= factor[a, b] * slopes[i, e, k, b]
-            slopes[i, e, k, a] = value / factor[a, a]
-        for r in range(size + 3):
-            value = by_theta[e, r] if r < size else 0.0
-            for a in range(3):
-                value += gain[r, a] * slopes[i, e, k, a]
-            by_theta[e, r] = value
-
-
-@njit(_nrt=False)
-@no_type_check
-def _factorise(matrix):
-    """Cholesky factor in the lower triangle, in place; returns the log determinant."""
-    result = 0.0
-    for j in range(3):
-        for i in range(j, 3):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                matrix[j, j] = math.sqrt(value)
-                result += 2.0 * math.log(matrix[j, j])
-            else:
-                matrix[i, j] = value / matrix[j, j]
-    return result
-
-
-@njit(_nrt=False)
-@no_type_check
-def _forward(factor, vector):
-    """Solve L y = vector in place."""
-    for i in range(3):
-        value = vector[i]
-        for k in range(i):
-            value -= factor[i, k] * vector[k]
-        vector[i] = value / factor[i, i]
-
-
-explain_range = _compile_explain_range(source_stamp(sys.modules[__name__]))
+explain_range = _compile_explain_range(source_stamp(sys.modules[__name__], kernel_filter))
 """Evaluate particles `first` up to `last`: (points, law, given, measured, by_theta, found,
 first, last).
 

@@ -1,15 +1,14 @@
-"""Compiled search for the rest pose of one substep, and its linear response.
+"""Compiled search for the rest pose of one substep.
 
-The same model as `settle` and `implicit`: in every round the lowest points of each terrain
-join a short list of candidates, the contact problem of the list is solved, and its active
-rows give a Newton step on Coulomb's law that spares most rounds of the fixed point. All
-arrays live in one `Space`, made once for each thread; nothing is allocated inside.
+The same model as `settle`: in every round the lowest points of each terrain join a short list
+of candidates, the contact problem of the list is solved, and its active rows give a Newton step
+on Coulomb's law that spares most rounds of the fixed point. Nothing is allocated inside.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -17,9 +16,9 @@ from numba import njit
 from tpcd.qp.compiled import solve_whitened_3
 from tpcd.qp.problem import Status
 from tpcd.simulator.kernel_geometry import lowest_point, object_normal
+from tpcd.simulator.kernel_linear import linear_system, respond
+from tpcd.simulator.kernel_space import LIST
 
-LIST = 8
-"""Candidate points kept for each terrain."""
 NEWTON_ROUNDS = 6
 """Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
 PROBE = 0.02
@@ -32,89 +31,7 @@ JAMMED = 4
 _SOLVED = int(Status.SOLVED)
 
 
-class Law(NamedTuple):
-    """What all elements share: impedance, its root, and the settings of the step."""
-
-    stiffness: np.ndarray
-    root: np.ndarray
-    coulomb: bool
-    rounds: int
-    tolerance: float
-    compliance: float
-
-
-class Space(NamedTuple):
-    """Everything one element works on.
-
-    Candidates of terrain t (t, LIST): `listed` who, `place` (.., 4) its coordinates in the
-    end-effector frame, its tangential position at the start and the start's tangent lever.
-    Rows of the contact problem, up to 2 t LIST of them: `rows`, `values`, `sizes`,
-    `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The three
-    rows that may carry load: `chosen` (3, 3) point (-1 where free), terrain and place,
-    `multiplier`, `side`, `slipping`. `system` (15, 3) as filled by `linear_system`. `friction`
-    keeps that of a jammed step while it is answered without.
-    """
-
-    listed: np.ndarray
-    counts: np.ndarray
-    place: np.ndarray
-    load: np.ndarray
-    before: np.ndarray
-    rows: np.ndarray
-    values: np.ndarray
-    sizes: np.ndarray
-    lengths: np.ndarray
-    multipliers: np.ndarray
-    source: np.ndarray
-    motion: np.ndarray
-    slots: np.ndarray
-    work: np.ndarray
-    system: np.ndarray
-    chosen: np.ndarray
-    multiplier: np.ndarray
-    side: np.ndarray
-    slipping: np.ndarray
-    force: np.ndarray
-    right: np.ndarray
-    change: np.ndarray
-    gain: np.ndarray
-    friction: np.ndarray
-
-
-@njit
-@no_type_check
-def new_space(terrains):
-    """Room for one element at a time against so many terrains."""
-    width = 2 * terrains * LIST
-    return Space(
-        np.zeros((terrains, LIST), np.int64),
-        np.zeros(terrains, np.int64),
-        np.zeros((terrains, LIST, 4)),
-        np.zeros(terrains),
-        np.zeros(terrains),
-        np.empty((width, 3)),
-        np.empty(width),
-        np.empty(width),
-        np.empty(width),
-        np.empty(width),
-        np.zeros((width, 2), np.int64),
-        np.empty(3),
-        np.zeros(3, np.int64),
-        np.empty((8, 3)),
-        np.empty((15, 3)),
-        np.zeros((3, 3), np.int64),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros(3, np.bool_),
-        np.empty(3),
-        np.empty(3),
-        np.empty(3),
-        np.empty(3),
-        np.zeros(terrains),
-    )
-
-
-@njit(error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False, forceinline=True)
 @no_type_check
 def settle(world, o, chains, law, extent, start, command, space, pose):
     """Settle one element; leaves pose and loaded contacts, returns status and residual."""
@@ -164,7 +81,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose):
     return status, residual
 
 
-@njit(_nrt=False)
+@njit(_nrt=False, forceinline=True)
 @no_type_check
 def _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space):
     """List the points that could carry load at a pose, in round k; turns as (cos, sin)."""
@@ -215,7 +132,7 @@ def _add(world, o, t, point, start, u_start, v_start, space):
     place[t, k, 3] = -(u_start * x + v_start * z)
 
 
-@njit(error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False, forceinline=True)
 @no_type_check
 def _build_rows(world, o, law, command, pose, turn, space):
     """Unit whitened rows of all listed candidates, linearised at `pose`; returns their number."""
@@ -264,7 +181,7 @@ def _build_rows(world, o, law, command, pose, turn, space):
     return m
 
 
-@njit(_nrt=False)
+@njit(_nrt=False, forceinline=True)
 @no_type_check
 def _choose(world, o, law, pose, turn, space):
     """Read the loaded rows off the solved problem; returns the largest change of load [N]."""
@@ -302,104 +219,3 @@ def _choose(world, o, law, pose, turn, space):
     for t in range(world.normals.shape[1]):
         largest = max(largest, abs(space.load[t] - space.before[t]))
     return largest
-
-
-@njit(error_model="numpy", _nrt=False)
-@no_type_check
-def linear_system(world, o, law, command, pose, turn, space):
-    """Residuals and matrices of the rest equations at `pose`, as in `implicit`.
-
-    Fills `system`: constraint rows 0-2, force rows 3-5, inverse stiffness 6, force residual
-    7, row residual 8, inverse of the Schur complement 9-11, start rows 12-14. False where
-    the complement is singular.
-    """
-    system, chosen, multiplier = space.system, space.chosen, space.multiplier
-    turning = 0.0
-    for a in range(3):
-        system[7, a] = law.stiffness[a] * (pose[a] - command[a])
-    for j in range(3):
-        system[8, j] = 0.0
-        for a in range(3):
-            system[j, a] = 0.0
-            system[3 + j, a] = 0.0
-            system[12 + j, a] = 0.0
-        if chosen[j, 0] < 0:
-            continue
-        t, k = chosen[j, 1], chosen[j, 2]
-        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        x, z = space.place[t, k, 0], space.place[t, k, 1]
-        height, along = u * x + v * z, v * x - u * z
-        slope = space.side[j] * world.friction[o, t]
-        drag = 0.0 if (law.coulomb and space.slipping[j]) else slope
-        slip = along + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
-        gap = height + nx * pose[0] + nz * pose[1] - world.offsets[o, t]
-        system[8, j] = gap + drag * slip + law.compliance * space.load[t]
-        system[j, 0], system[j, 1] = nx + drag * nz, nz - drag * nx
-        system[j, 2] = along - drag * height
-        system[3 + j, 0], system[3 + j, 1] = nx + slope * nz, nz - slope * nx
-        system[3 + j, 2] = along - slope * height
-        for a in range(3):
-            system[7, a] -= multiplier[j] * system[3 + j, a]
-        turning += multiplier[j] * (height + slope * along)
-        system[12 + j, 0], system[12 + j, 1] = -drag * nz, drag * nx
-        system[12 + j, 2] = -drag * space.place[t, k, 3]
-    system[6, 0], system[6, 1] = 1.0 / law.stiffness[0], 1.0 / law.stiffness[1]
-    system[6, 2] = 1.0 / (law.stiffness[2] + turning)
-    for j in range(3):
-        for k in range(3):
-            value = 1.0 if j == k else 0.0
-            if chosen[j, 0] >= 0 and chosen[k, 0] >= 0:
-                value = law.compliance if chosen[j, 1] == chosen[k, 1] else 0.0
-                for a in range(3):
-                    value += system[j, a] * system[6, a] * system[3 + k, a]
-            system[9 + j, k] = value
-    return _invert(system)
-
-
-@njit(error_model="numpy", _nrt=False)
-@no_type_check
-def _invert(system):
-    """Invert the 3 x 3 matrix in rows 9-11 in place; False, and zeros, where it is singular."""
-    a, b, c = system[9, 0], system[9, 1], system[9, 2]
-    d, e, f = system[10, 0], system[10, 1], system[10, 2]
-    g, h, k = system[11, 0], system[11, 1], system[11, 2]
-    first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
-    determinant = a * first + b * second + c * third
-    scale = (abs(a) + abs(b) + abs(c)) * (abs(d) + abs(e) + abs(f)) * (abs(g) + abs(h) + abs(k))
-    if not abs(determinant) > 1e-12 * scale:
-        for j in range(3):
-            for i in range(3):
-                system[9 + j, i] = 0.0
-        return False
-    r = 1.0 / determinant
-    system[9, 0], system[9, 1], system[9, 2] = first * r, (c * h - b * k) * r, (b * f - c * e) * r
-    system[10, 0], system[10, 1] = second * r, (a * k - c * g) * r
-    system[10, 2], system[11, 0] = (c * d - a * f) * r, third * r
-    system[11, 1], system[11, 2] = (b * g - a * h) * r, (a * e - b * d) * r
-    return True
-
-
-@njit(_nrt=False)
-@no_type_check
-def respond(space):
-    """Pose change for the right-hand sides `force` of the balance and `right` of the rows.
-
-    Leaves it in `change`, and the change of the multipliers in `gain`; `system` must be filled.
-    """
-    system, chosen, force = space.system, space.chosen, space.force
-    m0 = m1 = m2 = 0.0
-    for j in range(3):
-        if chosen[j, 0] < 0:
-            continue
-        right = space.right[j]
-        for a in range(3):
-            right -= system[j, a] * system[6, a] * force[a]
-        m0 += system[9, j] * right
-        m1 += system[10, j] * right
-        m2 += system[11, j] * right
-    space.gain[0], space.gain[1], space.gain[2] = m0, m1, m2
-    for a in range(3):
-        # Rows of free places are zero.
-        push = force[a] + m0 * system[3, a] + m1 * system[4, a] + m2 * system[5, a]
-        space.change[a] = system[6, a] * push

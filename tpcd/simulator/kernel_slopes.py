@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from tpcd.simulator.kernel_geometry import object_normal
-from tpcd.simulator.kernel_settle import respond
+from tpcd.simulator.kernel_linear import respond
 
 GRAZING = 1e-9
 """Share of the way's motion towards a terrain below which a touch only grazes it."""
@@ -70,7 +70,7 @@ def new_slopes(terrains, entries):
     )
 
 
-@njit(error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False, forceinline=True)
 @no_type_check
 def landing_response(world, o, start, command, fraction, point, terrain, slopes):
     """Derivatives of the first-touch pose by start (rows 0-2), command (3-5) and gaps."""
@@ -102,7 +102,7 @@ def landing_response(world, o, start, command, fraction, point, terrain, slopes)
             land[3 + a, c] = fraction * turn
 
 
-@njit(_nrt=False)
+@njit(_nrt=False, forceinline=True)
 @no_type_check
 def settling_response(law, terrains, space, slopes):
     """Derivatives of the settled pose by start, command, and gap and lever of each terrain.
@@ -136,7 +136,7 @@ def settling_response(law, terrains, space, slopes):
             slopes.by_terrain[terrains + t, a] = yields[a, 2] * space.load[t]
 
 
-@njit(_nrt=False)
+@njit(_nrt=False, forceinline=True)
 @no_type_check
 def append_part(slopes, follows, column, middle):
     """Append one settling to the derivatives of the whole step.

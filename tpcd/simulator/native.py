@@ -27,9 +27,9 @@ from tpcd.terrain import HalfPlane
 
 if TYPE_CHECKING:
     from tpcd.shape.protocol import Shape
-    from tpcd.simulator.kernel import Request
     from tpcd.simulator.kernel_geometry import World
-    from tpcd.simulator.kernel_settle import Law
+    from tpcd.simulator.kernel_request import Request
+    from tpcd.simulator.kernel_space import Law
 
 JAMMED = 4
 """Status of an element that the compiled loops leave to the torch path."""
@@ -111,7 +111,8 @@ def step(
 
     Outlines may broadcast against the planes of the scene and are then not repeated.
     """
-    from tpcd.simulator.kernel import Answer, step_range
+    from tpcd.simulator.kernel import step_range
+    from tpcd.simulator.kernel_request import Answer
 
     count, terrains = len(owner), len(scene.terrains)
     pose = torch.empty(count, 3, dtype=torch.float64)
@@ -164,7 +165,7 @@ def world_of(scene: ContactScene) -> World:
 
 def law_of(settings: StepSettings) -> Law:
     """Settings as the compiled loops read them; the stiffness is set for each transition."""
-    from tpcd.simulator.kernel_settle import Law
+    from tpcd.simulator.kernel_space import Law
 
     return Law(
         np.ones(3),
@@ -186,7 +187,7 @@ def request_of(
     settings: StepSettings,
 ) -> Request:
     """Transitions, as the compiled loops read them."""
-    from tpcd.simulator.kernel import Request
+    from tpcd.simulator.kernel_request import Request
 
     outlines = scene.points_ee.shape[:-2]
     mine = torch.arange(outlines.numel()).reshape(outlines).expand(scene.batch_shape).reshape(-1)

@@ -1,0 +1,151 @@
+"""What the compiled step is asked and where its answers go; planes, law and chains of a scene."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from tpcd.simulator.kernel_geometry import build_chains
+from tpcd.simulator.kernel_settle import PROBE
+from tpcd.simulator.kernel_space import Law
+
+
+class Request(NamedTuple):
+    """What is asked of b transitions: outline, planes, start pose, command before and command.
+
+    `owner` and `place` (b) say whose points and whose planes of the `World` a transition has.
+    `stiffness` is (b or 1, 3). `rested` says that nothing was commanded before, so that
+    `previous` equals the start.
+    """
+
+    owner: np.ndarray
+    place: np.ndarray
+    stiffness: np.ndarray
+    starts: np.ndarray
+    previous: np.ndarray
+    commands: np.ndarray
+    rested: bool
+    substeps: int
+    follow_path: bool
+
+
+class Answer(NamedTuple):
+    """Where the answers go; the fields of `Transition` but the wrench.
+
+    `contacts` (b, t, 4) are normal and tangential force, and the arm of the contact point from
+    the end effector in world axes.
+    """
+
+    poses: np.ndarray
+    modes: np.ndarray
+    statuses: np.ndarray
+    residuals: np.ndarray
+    from_start: np.ndarray
+    from_gap: np.ndarray
+    from_lever: np.ndarray
+    contacts: np.ndarray
+
+
+@njit
+@no_type_check
+def new_planes(terrains):
+    """Room for the planes of one transition."""
+    return np.zeros((1, terrains, 2)), np.zeros((1, terrains)), np.zeros((1, terrains))
+
+
+@njit
+@no_type_check
+def own_law(law):
+    """A copy of the law whose stiffness can be set for each transition."""
+    return Law(np.ones(3), np.ones(3), law.coulomb, law.rounds, law.tolerance, law.compliance)
+
+
+@njit(_nrt=False)
+@no_type_check
+def set_planes(here, normals, offsets, friction, place):
+    """Take over the planes at a place of (.., t, 2) and (.., t)."""
+    for t in range(here.offsets.shape[1]):
+        here.normals[0, t, 0], here.normals[0, t, 1] = normals[place, t, 0], normals[place, t, 1]
+        here.offsets[0, t], here.friction[0, t] = offsets[place, t], friction[place, t]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def set_stiffness(law, stiffness):
+    """Take over a stiffness (3) and its root."""
+    for a in range(3):
+        law.stiffness[a], law.root[a] = stiffness[a], math.sqrt(stiffness[a])
+
+
+@njit(_nrt=False)
+@no_type_check
+def prepare(world, o, law, request, first, last, chains):
+    """Chains of a scene for some transitions; returns how far its outline reaches [m]."""
+    extent = _reach(world, o)
+    if math.isfinite(extent):
+        low, high = _angles(request, first, last)
+        lean = 0.0 if law.coulomb else _largest(world.friction, o) * (high - low)
+        build_chains(world, o, low, high, 2.0 * PROBE + lean, chains)
+    return extent
+
+
+@njit(_nrt=False)
+@no_type_check
+def _reach(world, o):
+    """Distance of the furthest point from the end effector [m]; not finite for a bad outline."""
+    largest, total = 0.0, 0.0
+    for i in range(world.points.shape[2]):
+        square = world.points[o, 0, i] ** 2 + world.points[o, 1, i] ** 2
+        total += square
+        largest = max(largest, square)
+    # A NaN is no maximum, but it spoils the sum.
+    return math.sqrt(largest) if math.isfinite(total) else np.nan
+
+
+@njit(_nrt=False)
+@no_type_check
+def sound(world, o, law):
+    """Whether planes and stiffness are finite, and the stiffness positive."""
+    total = 0.0
+    for t in range(world.normals.shape[1]):
+        total += abs(world.offsets[o, t]) + abs(world.friction[o, t])
+        total += abs(world.normals[o, t, 0]) + abs(world.normals[o, t, 1])
+    for a in range(3):
+        total += law.root[a] if law.stiffness[a] > 0.0 else np.inf
+    return math.isfinite(total)
+
+
+@njit(_nrt=False)
+@no_type_check
+def _angles(request, first, last):
+    """Least and largest object angle on the straight ways of some transitions [rad]."""
+    low, high = np.inf, -np.inf
+    for b in range(first, last):
+        start = request.starts[b, 2]
+        for angle in (
+            start,
+            start + wrap(request.previous[b, 2] - start),
+            start + wrap(request.commands[b, 2] - start),
+        ):
+            if math.isfinite(angle):
+                low, high = min(low, angle), max(high, angle)
+    return (low, high) if low <= high else (0.0, 0.0)
+
+
+@njit(_nrt=False)
+@no_type_check
+def _largest(values, o):
+    largest = 0.0
+    for t in range(values.shape[1]):
+        largest = max(largest, abs(values[o, t]))
+    return largest
+
+
+@njit(_nrt=False)
+@no_type_check
+def wrap(angle):
+    """The angle wrapped to (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)

@@ -72,7 +72,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     from tpcd.policies import ActivePolicy, Limits
     from tpcd.predict import CHANNELS, ContactPredictor
     from tpcd.results import format_table, write_results
-    from tpcd.robot import SimulatedRobot
+    from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record, write_recording

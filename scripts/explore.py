@@ -49,7 +49,7 @@ def explore_object(config: Exploration) -> None:
     from tpcd.commands.exploring import EPISODE_NAME, Stage, explore_in_folder
     from tpcd.policies import make_policy
     from tpcd.random import stream
-    from tpcd.robot import SimulatedRobot
+    from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.named import find_outline
     from tpcd.truth.recording import recording_contents
     from tpcd.truth.scene import draw_scene, make_truth

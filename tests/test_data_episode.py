@@ -67,9 +67,7 @@ def episodes(draw) -> Episode:
 
 
 @given(episode=episodes(), format=st.sampled_from(["csv", "parquet"]))
-@settings(
-    max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_reading_what_was_written_returns_every_bit(episode, format, tmp_path):
     path = write_episode(episode, tmp_path / "a.b", format=format, overwrite=True)
     back = read_episode(path)

@@ -16,7 +16,8 @@ from tpcd.commands.exploring import Stopping
 from tpcd.data.episode import Episode, read_episode
 from tpcd.exploration import Estimator, ExplorationStep, explore
 from tpcd.policies import ActivePolicy, ActiveSettings, Limits, Policy, make_policy
-from tpcd.robot import Robot, SimulatedRobot
+from tpcd.robot.protocol import Robot
+from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.truth.recording import read_truth

@@ -27,7 +27,7 @@ from tpcd.policies.active import Task
 from tpcd.policies.basic import best_within
 from tpcd.policies.lookahead import second_step_gain
 from tpcd.predict import ContactPredictor
-from tpcd.robot import SimulatedRobot
+from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.truth.motions import press_and_slide, rich_exploration

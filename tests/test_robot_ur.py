@@ -26,7 +26,8 @@ from tpcd.robot.emulator.process import running_emulator
 from tpcd.robot.frames import task_frame, tcp_pose
 from tpcd.robot.link import Link, Sample
 from tpcd.robot.protocol import Robot
-from tpcd.robot.raw import COLUMNS
+from tpcd.robot.raw import COLUMNS, RawRecord
+from tpcd.robot.servo import Servo
 from tpcd.robot.ur import UniversalRobot
 
 pytest.importorskip("rtde_control")
@@ -282,18 +283,17 @@ class StubLink(Link):
         ((0.2, 0.1, 0.0), 0.0, "does not follow"),
     ],
 )
-def test_single_readings_are_guarded(pose: tuple, force: float, said: str, tmp_path: Path) -> None:
-    arm = UniversalRobot(ArmSettings("nowhere"), tmp_path, lambda _: True)
+def test_single_readings_are_guarded(pose: tuple, force: float, said: str) -> None:
     frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
     wrench = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
     tcp = tcp_pose(frame, np.array(pose))
     samples = [Sample(0.008 * k, tcp, wrench, tcp, 0.0) for k in range(3)]
-    arm._frame, arm._link = frame, StubLink(samples)
+    servo = Servo(ArmSettings("nowhere"), StubLink(samples), frame, RawRecord())
     if said == "does not follow":
-        arm._state = at_rest(np.array([0.1, 0.1, 0.0]), np.zeros(3))
+        servo.state = at_rest(np.array([0.1, 0.1, 0.0]), np.zeros(3))
     with pytest.raises(RobotError, match=said):
         for _ in range(3):
-            arm._read()
+            servo.read()
 
 
 def robot_command(*arguments: str) -> int:

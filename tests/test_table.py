@@ -88,7 +88,7 @@ def test_bootstrap_draws_whole_objects() -> None:
 
 
 def test_the_top_particles_are_those_of_the_largest_weights() -> None:
-    from tpcd.robot import SimulatedRobot
+    from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.truth.scene import draw_scene, make_truth
 

@@ -209,7 +209,7 @@ def _situations(
     from tpcd.exploration import explore
     from tpcd.policies import Limits, Situation, make_policy
     from tpcd.random import stream
-    from tpcd.robot import SimulatedRobot
+    from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.truth.scene import draw_scene, make_truth
 

@@ -22,7 +22,7 @@ from tpcd.exploration import Estimator, explore
 from tpcd.policies import Limits, make_policy
 from tpcd.predict import ContactPredictor
 from tpcd.random import stream
-from tpcd.robot import SimulatedRobot
+from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.protocol import Shape
 from tpcd.truth.protocol import Truth

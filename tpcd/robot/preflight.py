@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from tpcd.errors import RobotError
+from tpcd.robot.settling import SettlingSettings
 
 LARGEST_BEFORE_ZEROING = 10.0
 """Force in free air that only a wrong payload or a contact explains [N]."""
@@ -126,3 +127,22 @@ def _slope_noise(air: FreeAir) -> float:
     """Standard deviation of a fitted slope of a force, if readings are independent [N/s]."""
     spread = air.stamps.std() * np.sqrt(len(air.stamps))
     return float((reading_noise(air)[:2] / spread).max())
+
+
+def row_noise(
+    air: FreeAir, turning: float, settling: SettlingSettings, stiffness: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 6"]:
+    """Standard deviations of a row, from readings in free air and the force that `turning` the
+    tool leaves [N].
+
+    A row is taken once the mean wrench is K (r - u) to within what counts as still, so the fast
+    noise of the force is no longer in the force: the spring has turned it into motion, in free air
+    in full and in contact, damped more, hardly; half of it is taken.
+    """
+    fast, slow = mean_noise(air, settling.window)
+    still = 0.5 * np.array(settling.residual)
+    moved = np.sqrt(still**2 + (0.5 * fast[3:]) ** 2 + slow[3:] ** 2) / stiffness
+    pose_std = np.sqrt(fast[:3] ** 2 + slow[:3] ** 2 + moved**2)
+    wrench_std = np.hypot(still, slow[3:])
+    wrench_std[:2] = np.hypot(wrench_std[:2], 0.5 * turning)
+    return np.concatenate((pose_std, wrench_std))

@@ -33,7 +33,7 @@ class EmulatorSettings:
     address: str = "127.0.0.1"
     """Loopback address to listen on; another one for each emulator at a time."""
     outline: str = "mug"
-    """Outline that plays the unknown object."""
+    """Outline that plays the unknown object: a built-in or YCB name, or a file."""
     seed: int = 0
     """Seed of the scene and of the sensors' noise."""
     friction: tuple[float, float] = (0.1, 0.9)

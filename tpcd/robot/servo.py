@@ -1,0 +1,176 @@
+"""The servo loop of an arm: hold, go straight, give way to a command, retreat.
+
+Every reading is checked (fresh stamp, safety system, force, workspace, whether the arm follows) and
+recorded, whatever the arm is doing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.errors import RobotError
+from tpcd.robot.admittance import AdmittanceState, advance, at_rest, residual
+from tpcd.robot.arm_settings import ArmSettings
+from tpcd.robot.frames import TaskFrame, planar_pose, planar_wrench
+from tpcd.robot.frames import tcp_pose as tcp_of
+from tpcd.robot.link import Link, Sample
+from tpcd.robot.preflight import FreeAir
+from tpcd.robot.protocol import Reading
+from tpcd.robot.raw import RawRecord
+from tpcd.robot.settling import SettlingSettings, Window
+
+MARGIN = (0.005, 0.005, 0.02)
+"""How far a pose may be outside of the workspace before the arm stops [m, m, rad]."""
+FOLLOWING = (0.015, 0.015, 0.1)
+"""How far the arm may be from its target: the delay's way at full speed, several times over."""
+RAMP_SPEED = 0.03
+"""Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
+RAMP_FORCE, RETREAT_FORCE = 4.0, 10.0
+"""Further force that ends a move in free air, and a retreat, at whose start friction turns [N]."""
+LARGEST_STEP = 0.05
+"""Of the admittance after a pause of this process [s]."""
+
+
+class Servo:
+    """The loop from reading to target of one connected arm, in its task frame."""
+
+    def __init__(self, settings: ArmSettings, link: Link, frame: TaskFrame, raw: RawRecord) -> None:
+        """An arm that is only read, until `state` is set."""
+        self.settings, self.link, self.frame, self._raw = settings, link, frame, raw
+        self._law, self.settling = settings.admittance, SettlingSettings()
+        self.state: AdmittanceState | None = None
+        """Where the arm is sent; None while it is only read."""
+        self.noise = np.zeros(3)
+        """Standard deviation of single readings of the wrench [N, N, N·m]."""
+        self._over = 0
+
+    def read(self) -> tuple[Sample, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """The next reading, checked and recorded."""
+        frame, state = self.frame, self.state
+        sample = self.link.next_sample()
+        pose, wrench = planar_pose(frame, sample.tcp), planar_wrench(frame, sample.wrench)
+        reference = pose if state is None else state.reference
+        self._raw.add(sample, pose, wrench, reference)
+        limit = self.settings.stop_force * np.array([1.0, 1.0, 0.2])
+        self._over = self._over + 1 if bool((np.abs(wrench) > limit).any()) else 0
+        if self._over > 1:
+            raise RobotError(
+                f"a wrench of ({wrench[0]:.1f}, {wrench[1]:.1f} N, {wrench[2]:.2f} N·m), beyond the"
+                f" limit of {self.settings.stop_force:g} N"
+            )
+        off = np.abs(pose - reference)
+        if bool((off > FOLLOWING).any()):
+            raise RobotError(
+                f"the arm is {1e3 * off[:2].max():.0f} mm and {1e3 * off[2]:.0f} mrad from its"
+                " target; it does not follow: look at speed slider, joint limits and collisions"
+            )
+        self.check_inside("the arm", pose, MARGIN)
+        return sample, pose, wrench
+
+    def stand(self, seconds: float) -> FreeAir:
+        """Readings of an arm that is not moved."""
+        rows: list[np.ndarray] = []
+        frame, state = self.frame, self.state
+        while not rows or rows[-1][0] - rows[0][0] < seconds:
+            sample, pose, wrench = self.read()
+            if state is not None:
+                self.link.servo(tcp_of(frame, state.reference))
+            rows.append(np.concatenate(([sample.stamp], pose, wrench)))
+        table = np.array(rows)
+        return FreeAir(table[:, 0], table[:, 1:4], table[:, 4:7])
+
+    def ramp_to(self, goal: Float[np.ndarray, " 3"], allowed: float = RAMP_FORCE) -> None:
+        """Straight to a pose; RobotError where a force grows by more than `allowed` [N]."""
+        link, frame = self.link, self.frame
+        before: np.ndarray | None = None
+        waited = 0
+        while waited < 0.3 * link.rate:
+            _, pose, wrench = self.read()
+            state = self.state or at_rest(pose, np.zeros(3))
+            before = wrench if before is None else before
+            if float((np.abs(wrench) - np.abs(before))[:2].max()) > allowed:
+                raise RobotError(
+                    f"the arm met a force of {np.abs(wrench[:2]).max():.1f} N on its way through"
+                    " what should be free air"
+                )
+            way = goal - state.reference
+            steps = max(np.hypot(way[0], way[1]), abs(way[2]) / 10) / RAMP_SPEED * link.rate
+            waited += steps < 1
+            reference = state.reference + way / max(1.0, float(steps))
+            self.state = AdmittanceState(reference, np.zeros(3), wrench)
+            link.servo(tcp_of(frame, reference))
+
+    def retreat(self) -> Float[np.ndarray, " 3"]:
+        """Away from what may be touched, then up; the arm holds where the way is not free.
+
+        The world has a floor below and a wall on the right, and both may be felt only through
+        friction. So the way is up, and at first also to the left where the arm is pushed there.
+        """
+        assert self.state is not None, "never moved"
+        settings, here = self.settings, self.state.reference
+        self._over = -(10**6)  # The limit may be exceeded still: the ramp looks to the force.
+        left = -1.0 if float(self.state.wrench[0]) < -1.0 else 0.0
+        low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
+        try:
+            for way in (np.array([left, 1.0, 0.0]), np.array([0.0, 1.0, 0.0])):
+                goal = here + 0.5 * settings.retreat * way
+                goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
+                self.ramp_to(goal, RETREAT_FORCE)
+                here = self.state.reference
+        finally:
+            self._over = 0
+        return here
+
+    def settle(self, command: Float[np.ndarray, " 3"]) -> Reading:
+        """Give way to a command until pose and force are steady, and average them."""
+        link, frame = self.link, self.frame
+        assert self.state is not None, "start first"
+        window, last, began = Window(self.settling, self.noise), None, None
+        count, still = 0, None
+        while still is None:
+            sample, pose, wrench = self.read()
+            began = sample.stamp if began is None else began
+            passed = 1 / link.rate if last is None else sample.stamp - last
+            last = sample.stamp
+            state = advance(self._law, self.state, command, wrench, min(passed, LARGEST_STEP))
+            self.state = state
+            link.servo(tcp_of(frame, state.reference))
+            window.add(sample.stamp, pose, wrench, residual(self._law, state, command))
+            count += 1
+            if count % 12:
+                continue
+            if window.unstable():
+                raise RobotError(
+                    "the force oscillates: the surface is stiffer than stated, or the arm slower;"
+                    f" state less than {self.settings.surface_mm_per_10n:g} mm per 10 N"
+                )
+            still = window.still()
+            if still is None and sample.stamp - began > self.settings.settle_time:
+                break
+        settled = still is not None
+        still = still or window.mean()
+        return Reading(
+            tensor_of(still.pose), tensor_of(still.wrench), settled, stamps=(still.start, still.end)
+        )
+
+    def check_inside(
+        self, what: str, pose: Float[np.ndarray, " 3"], margin: tuple[float, ...] = (1e-9,) * 3
+    ) -> None:
+        """Raises RobotError for a pose outside of the workspace, give or take a margin."""
+        low, high = (
+            np.array(v) for v in (self.settings.workspace_low, self.settings.workspace_high)
+        )
+        if bool((pose < low - margin).any() or (pose > high + margin).any()):
+            shown = ", ".join(f"{value:.3f}" for value in pose)
+            raise RobotError(
+                f"{what} is at ({shown}) [m, m, rad], outside of the workspace from"
+                f" {self.settings.workspace_low} to {self.settings.workspace_high}"
+            )
+
+
+def tensor_of(values: np.ndarray) -> Tensor:
+    """A float64 copy."""
+    return torch.from_numpy(np.asarray(values, dtype=np.float64).copy())

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.cloud import SamplerSettings, start_cloud
 from tpcd.belief.history import history_of, joined_history
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
@@ -19,14 +19,14 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.confusion import confusions, signatures
-from tpcd.discrepancy.coverage import MOTIONS, NEEDED, contact_rows, coverage_of
+from tpcd.discrepancy.coverage import MOTIONS, NEEDED, Coverage, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
-from tpcd.discrepancy.evidence import Question, fit_model
+from tpcd.discrepancy.evidence import Fit, Question, fit_model
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
 from tpcd.discrepancy.memory import Memory
-from tpcd.discrepancy.naming import Workbench
+from tpcd.discrepancy.naming import Workbench, fitted_again
 from tpcd.discrepancy.report_parts import shown_value
-from tpcd.discrepancy.search import DiagnosisSettings, diagnose
+from tpcd.discrepancy.search import DiagnosisSettings, diagnose, fitted_out
 from tpcd.effects import find_effect
 from tpcd.effects.protocol import EffectParameter
 from tpcd.errors import RunError
@@ -121,6 +121,53 @@ def test_a_simulator_that_lifts_what_slides_is_called_numerics(shape: PolygonSha
     assert found.belief is not None and found.belief.step.friction == "anitescu"
 
 
+@pytest.mark.parametrize(
+    ("evidence", "used", "draws"),
+    [([5.0, 4.0, 90.0], 2, 40), ([50.0, 90.0, 95.0, 200.0], 3, 40), ([5.0, 4.0], 2, 1)],
+)
+def test_the_model_found_is_fitted_again_while_the_search_climbs(
+    shape: PolygonShape,
+    evidence: list[float],
+    used: int,
+    draws: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[str] = []
+    bench = Workbench(Question.__new__(Question), SMALL, Coverage({}), 0, told.append)
+    begin = start_cloud(torch.arange(2.0 * draws, dtype=torch.float64).reshape(-1, 2))
+    first = Fit((), StepSettings(), make_prior(shape), (0.0,), (begin,))
+    asked: list[int] = []
+
+    def fit_model(question: object, effects: object, seeds: tuple[int, ...], **_: object) -> Fit:
+        asked.extend(seeds)
+        found = evidence[len(asked) - 1]
+        return Fit(
+            (), StepSettings(), make_prior(shape), (found,), (replace(begin, log_evidence=found),)
+        )
+
+    monkeypatch.setattr("tpcd.discrepancy.naming.fit_model", fit_model)
+    fit = fitted_out(bench, first)
+    assert len(asked) == used == len(set(asked)) and len(fit.by_seed) == used + 1
+    assert bool(told) == (draws == 1) == bool(bench.notes)
+
+
+def test_a_fit_that_fails_when_made_again_costs_nothing(
+    shape: PolygonShape, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    bench = Workbench(Question.__new__(Question), SMALL, Coverage({}), 0, told.append)
+    fit = Fit((find_effect("floor_tilt"),), StepSettings(), make_prior(shape), (0.0,), ())
+
+    def broken(*_: object, **__: object) -> Fit:
+        raise ValueError("no particle explains it")
+
+    monkeypatch.setattr("tpcd.discrepancy.naming.fit_model", broken)
+    assert fitted_again(bench, fit, 1, ()) is fit
+    assert told == [
+        "warning: floor_tilt failed when fitted again: ValueError: no particle explains it"
+    ]
+
+
 def test_a_diagnosis_that_was_stopped_goes_on_with_the_fits_it_had(
     shape: PolygonShape, clean: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,7 +186,8 @@ def test_a_diagnosis_that_was_stopped_goes_on_with_the_fits_it_had(
     # Other data are another question.
     with pytest.raises(AssertionError, match="made again"):
         diagnose([clean.first(25)], shape, SMALL, memory=Memory(tmp_path))
-    kept[0].write_bytes(b"half")
+    for path in kept:
+        path.write_bytes(b"half")
     with pytest.raises(RunError, match="cannot be read"):
         diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
 

@@ -155,8 +155,13 @@ def test_ctrl_c_in_a_move_retreats_and_keeps_it(emulator, tmp_path: Path) -> Non
     arm = arm_on(emulator, tmp_path)
     try:
         x, z, _ = arm.start().poses[0].tolist()
-        timer = threading.Timer(0.4, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
+
+        def interrupt() -> None:
+            while arm._row == 0 or len(arm._raw) < 20:
+                time.sleep(0.002)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        threading.Thread(target=interrupt, daemon=True).start()
         with pytest.raises(KeyboardInterrupt):
             arm.settle(command(x + 0.1, z - 0.06))
         assert arm.at_rest == "the arm has retreated"

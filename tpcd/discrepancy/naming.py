@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
+from torch import Tensor
+
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, Coverage
@@ -90,6 +92,24 @@ def fit_well(bench: Workbench, effects: Sequence[Effect], start: Sequence[Fit] =
     return fit
 
 
+def fitted_again(
+    bench: Workbench,
+    fit: Fit,
+    seed: int,
+    start: Sequence[Fit],
+    question: Question | None = None,
+    places: Tensor | None = None,
+) -> Fit:
+    """The fit with one more seed of its model, as for `fit_model`; as it is where that fails."""
+    asked = bench.question if question is None else question
+    try:
+        return joined_fit(fit, fit_model(asked, fit.effects, (seed,), start=start, places=places))
+    except Exception as error:
+        model = ", ".join(fit.names) or "the base model"
+        bench.warn(f"{model} failed when fitted again: {type(error).__name__}: {error}")
+        return fit
+
+
 def find_confusions(bench: Workbench, base: Fit) -> None:
     """Note which effects these data could not tell apart, whatever their truth is."""
     effects = bench.excited(bench.settings.catalogue)
@@ -110,14 +130,14 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     chosen = [g.effect for g in glances[: settings.full_fits] if g.log_evidence > worth]
     places = {g.effect.name: g.place[None] for g in glances}
 
-    def fitted(effect: Effect, seed: int) -> Fit:
+    def fitted(effect: Effect) -> Fit:
         effects, found = (*current.effects, effect), places[effect.name]
-        return fit_model(question, effects, (seed,), start=(current,), places=found)
+        return fit_model(question, effects, (0,), start=(current,), places=found)
 
-    fits = _each(bench, chosen, number, lambda effect: fitted(effect, 0))
+    fits = _each(bench, chosen, number, fitted)
     top = max((fit.log_evidence for fit in fits), default=-math.inf)
     near = [
-        _again(bench, fit, lambda fit: fitted(fit.effects[-1], 1))
+        fitted_again(bench, fit, 1, (current,), places=places[fit.names[-1]])
         if fit.log_evidence > current.log_evidence
         else fit
         for fit in fits
@@ -125,17 +145,13 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     ]
     near.sort(key=lambda fit: -fit.log_evidence)
     if settings.base_refit and near:
-        start = (current, *near[:2])
-        base = _again(bench, current, lambda fit: fit_model(question, fit.effects, (10,), start))
+        base = fitted_again(bench, current, 10, (current, *near[:2]))
         found = base.by_seed[len(current.by_seed) :]
         better = max(found, default=-math.inf) > current.log_evidence + IMPROVED
         current = base
         if better:
             # What the base model has learnt from the alternatives, they may learn from it.
-            near = [
-                _again(bench, fit, lambda fit: fit_model(question, fit.effects, (11,), (base, fit)))
-                for fit in near[:2]
-            ]
+            near = [fitted_again(bench, fit, 11, (current, fit)) for fit in near[:2]]
             near.sort(key=lambda fit: -fit.log_evidence)
     lead = near[0].log_evidence - current.log_evidence if near else -math.inf
     if UNDECIDED[adequate] < lead < SURE:
@@ -214,10 +230,8 @@ def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit
             sampler, fresh_modes=CLOSER * sampler.fresh_modes, draws=CLOSER * sampler.draws
         ),
     )
-    start = (current, near[0])
-    base, best = (
-        _again(bench, fit, lambda fit: fit_model(wide, fit.effects, (30,), start)) for fit in start
-    )
+    both = (current, near[0])
+    base, best = (fitted_again(bench, fit, 30, both, question=wide) for fit in both)
     return base, sorted((best, *near[1:]), key=lambda fit: -fit.log_evidence)
 
 
@@ -250,16 +264,6 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
         if fit.log_evidence > best.log_evidence - AMBIGUOUS
     )
     return Round(current, best if accepted else None, close)
-
-
-def _again(bench: Workbench, fit: Fit, work: Callable[[Fit], Fit]) -> Fit:
-    """A fit joined with another one of its model; where that one fails, the fit as it is."""
-    try:
-        return joined_fit(fit, work(fit))
-    except Exception as error:
-        model = ", ".join(fit.names) or "the base model"
-        bench.warn(f"{model} failed when fitted again: {type(error).__name__}: {error}")
-        return fit
 
 
 def _each(

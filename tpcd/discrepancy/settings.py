@@ -33,8 +33,10 @@ VETO_LEVEL = 0.2
 """Of the bound of the held-out gain. What shows in one stretch of the data alone, such as a push
 that static friction holds, is missed by the bootstrap in a third of its draws, so that a bound
 at 5 % would never let it pass."""
-FINAL_SEEDS = (20, 21)
-"""Further seeds of the model that was found."""
+FINAL_SEEDS = tuple(range(20, 28))
+"""Further seeds of the model that was found, of which two or more are used."""
+FEWEST_DRAWS = 5
+"""Effective number of draws below which intervals are said to be unsure."""
 
 
 @dataclass(frozen=True)

@@ -208,9 +208,11 @@ def test_sizes_and_theta_are_scored_against_the_key() -> None:
                                                      theta=theta))  # fmt: skip
     assert one.size_errors == pytest.approx((0.1,))
     assert one.size_inside == (False, True)
-    assert one.theta_scores == pytest.approx((2.0, 4.0))
+    assert one.theta_scores == pytest.approx({"friction": 2.0, "scale": 4.0})
+    (line,) = [row for row in mark_table([one]) if row["item"].startswith("theta")]
+    assert line["found"] == "50.0%" and "scale 0%, the others 100%" in line["note"]
     missed = score_line(key("medium", "payload"), found("named", "force_bias", theta=theta))
-    assert (missed.size_errors, missed.theta_scores) == ((), ())
+    assert (missed.size_errors, missed.theta_scores) == ((), {})
 
 
 def test_intervals_of_shares_and_medians() -> None:

@@ -135,6 +135,24 @@ def _pooled(values: Callable[[Score], Sequence[bool]]) -> Callable[[Sequence[Sco
     return found
 
 
+def _theta_within(scores: Sequence[Score]) -> Finding:
+    """Entries of theta near the truth, with the worst of them by name. The scale multiplies an
+    outline that has a size of its own, which for an object that the prior does not hold is another
+    one than the true outline's."""
+    chosen = [s for s in scores if s.suite == "medium" and s.theta_scores]
+    names = dict.fromkeys(name for s in chosen for name in s.theta_scores)
+    near = {name: [s.theta_scores[name] <= THETA for s in chosen] for name in names}
+    pooled = [value for values in near.values() for value in values]
+    worst = min(near, key=lambda name: sum(near[name]), default="")
+    rest = [value for name, values in near.items() if name != worst for value in values]
+    note = f"of {len(pooled)} numbers"
+    if rest:
+        share = sum(near[worst]) / len(near[worst])
+        note += f"; {worst} {share:.0%}, the others {sum(rest) / len(rest):.0%}"
+    finding = _of(sum(pooled), len(pooled), note)
+    return Finding(finding.value, finding.low, finding.high, len(chosen), note)
+
+
 def _is_clean(score: Score) -> bool:
     return score.label == CLEAN
 
@@ -170,10 +188,7 @@ MARKS = (
     Mark("gap closed, medium, median", 0.9, _INF, _median(("medium",), lambda s: (s.closed,))),
     Mark("effect size: median error", -_INF, 0.1, _median(("medium",), lambda s: s.size_errors)),
     Mark("effect size: 90 % intervals cover", 0.85, 0.97, _pooled(lambda s: s.size_inside)),
-    Mark(
-        "theta within 3 sd after the repair", 0.9, _INF,
-        _pooled(lambda s: [score <= THETA for score in s.theta_scores]),
-    ),
+    Mark("theta within 3 sd after the repair", 0.9, _INF, _theta_within),
     Mark("MuJoCo, clean: physical name", -_INF, 0.0, _share("mujoco", is_falsely_named, _is_clean)),
     Mark(
         "MuJoCo, injected effect: exact", 0.8, _INF,

@@ -56,8 +56,8 @@ class Score:
     """Relative errors of the sizes of the effects, where exact."""
     size_inside: tuple[bool, ...]
     """Whether each 90 % interval of a parameter of an effect holds the truth, where exact."""
-    theta_scores: tuple[float, ...]
-    """Distances of theta from the truth in posterior deviations, where exact."""
+    theta_scores: dict[str, float]
+    """Distances of theta's entries from the truth in posterior deviations, where exact."""
     seconds: float
 
     @property
@@ -102,7 +102,7 @@ def score_line(key: Mapping[str, Any], line: Mapping[str, Any]) -> Score:
         closed=0.0 if truth and not names else _number(found["share_closed"]),
         size_errors=tuple(errors),
         size_inside=tuple(inside),
-        theta_scores=tuple(_theta(key["theta"], found["theta_after"]) if is_exact else ()),
+        theta_scores=_theta(key["theta"], found["theta_after"]) if is_exact else {},
         seconds=line["wall_s"] if "diagnosis" in line else math.nan,
     )
 
@@ -161,12 +161,12 @@ def _sizes(
     return errors, inside
 
 
-def _theta(true: Mapping[str, float], estimates: Iterable[Mapping[str, Any]]) -> list[float]:
-    return [
-        abs(one["value"] - true[one["name"]]) / max(_number(one["sd"]), 1e-12)
+def _theta(true: Mapping[str, float], estimates: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    return {
+        one["name"]: abs(one["value"] - true[one["name"]]) / max(_number(one["sd"]), 1e-12)
         for one in estimates
         if one["name"] in true
-    ]
+    }
 
 
 def _number(value: float | None) -> float:

@@ -18,12 +18,13 @@ from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, Coverage
 from tpcd.discrepancy.diagnosis import Alternative, Candidate, Confusion
-from tpcd.discrepancy.evidence import Fit, Question, fit_model, joined_fit
+from tpcd.discrepancy.evidence import TIED, Fit, Question, fit_model, joined_fit
 from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     CLOSER,
+    CLOSER_SEEDS,
     FRESH,
     IMPROVED,
     SURE,
@@ -192,10 +193,10 @@ def better_base(
     return (variant, question) if evidence >= max(reached) + bench.settings.least_gain else None
 
 
-def pruned(bench: Workbench, fit: Fit) -> Fit:
-    """The model without earlier effects that it no longer needs."""
+def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
+    """The model without effects that it no longer needs; the last one is not asked about."""
     own = fit.effects[bench.given :]
-    for effect in own[:-1]:
+    for effect in own[:-1] if but_last else own:
         less = tuple(e for e in fit.effects if e is not effect)
         other = fit_model(bench.question, less, (0, 1), start=(fit,))
         if fit.log_evidence - other.log_evidence < bench.settings.least_gain:
@@ -222,7 +223,8 @@ def _glances(
 
 def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit, list[Fit]]:
     """The base model and the best candidate with a larger search, each from where both arrived:
-    where they are close, what the search over shapes has missed may decide."""
+    where they are close, what the search over shapes has missed may decide. On while one of them
+    finds much more than before, since the search is still climbing then."""
     sampler = bench.settings.sampler
     wide = replace(
         bench.question,
@@ -230,9 +232,14 @@ def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit
             sampler, fresh_modes=CLOSER * sampler.fresh_modes, draws=CLOSER * sampler.draws
         ),
     )
-    both = (current, near[0])
-    base, best = (fitted_again(bench, fit, 30, both, question=wide) for fit in both)
-    return base, sorted((best, *near[1:]), key=lambda fit: -fit.log_evidence)
+    for seed in CLOSER_SEEDS:
+        both, others = (current, near[0]), near[1:]
+        before = [max(fit.by_seed) for fit in both]
+        current, best = (fitted_again(bench, fit, seed, both, question=wide) for fit in both)
+        near = sorted((best, *others), key=lambda fit: -fit.log_evidence)
+        if max(max(f.by_seed) - b for f, b in zip((current, best), before, strict=True)) < TIED:
+            break
+    return current, near
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

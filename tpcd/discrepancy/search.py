@@ -131,12 +131,13 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         while len(current.effects) - bench.given < settings.most_effects:
             first = len(current.effects) == bench.given
             found = name_one(bench, current, pool, bench.adequacy(current).adequate(0.05))
-            untried = first and pool is settings.catalogue and not variants
+            untried = pool is settings.catalogue and not variants
             if untried and not _explains(bench, found.base):
                 changed = _changed_base(bench, found)
                 if changed is not None:
-                    variant, base = changed
-                    current = base
+                    variant, current = changed
+                    bare = len(current.effects) == bench.given
+                    base = current if bare else fit_well(bench, effects, start=(current,))
                     variants.append(variant)
                     _tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
                     continue
@@ -168,9 +169,12 @@ def _changed_base(bench: Workbench, found: Round) -> tuple[Variant, Fit] | None:
     if better is None:
         return None
     variant, bench.question = better
-    bench.glances.clear()
-    bench.candidates[:] = [c for c in bench.candidates if c.round == 0]
-    return variant, fit_well(bench, found.base.effects, start=(found.base,))
+    number = len(found.base.effects) - bench.given + 1
+    if number == 1:
+        bench.glances.clear()
+    bench.candidates[:] = [c for c in bench.candidates if c.round < number]
+    fit = fit_well(bench, found.base.effects, start=(found.base,))
+    return variant, pruned(bench, fit, but_last=False)
 
 
 def fitted_out(bench: Workbench, fit: Fit) -> Fit:

@@ -24,6 +24,8 @@ IMPROVED = 2.0
 """Gain of the base model fitted again from which the best candidates are fitted again too."""
 CLOSER = 3
 """Times the budget with which a candidate that neither wins nor loses clearly is fitted again."""
+CLOSER_SEEDS = (30, 31, 32)
+"""Seeds of that, of which further ones are used while the search still climbs."""
 UNDECIDED = {True: 2.0, False: -10.0}
 """Gain from which it does not lose clearly: where the model explains the data, and where not."""
 AMBIGUOUS = 3.0

@@ -34,7 +34,7 @@ from tpcd.discrepancy.settings import (
     WORTH_FITTING,
     DiagnosisSettings,
 )
-from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, Variant
+from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, WIDE_SHAPE, Variant
 from tpcd.effects.protocol import Effect
 from tpcd.random import stream
 
@@ -171,10 +171,12 @@ def better_base(
     bench: Workbench, current: Fit, rival: Fit | None
 ) -> tuple[Variant, Question] | None:
     """The variant of the base model that explains the data best, if it does so better than the
-    model as it is and the `rival`, the best candidate."""
+    model as it is and the `rival`, the best candidate. After an effect only the shape is asked
+    about: what numerics do would have shown before it."""
     found: list[tuple[float, Variant, Question]] = []
     enough = rival is not None and bench.adequacy(rival).adequate(bench.settings.level)
-    for variant in VARIANTS:
+    first = len(current.effects) == bench.given
+    for variant in VARIANTS if first else (WIDE_SHAPE,):
         if enough and variant is FINER_STEPS:
             continue  # slow, and nothing is left for it to explain
         question = variant.change(bench.question)

@@ -23,31 +23,11 @@ import numpy as np
 from numba import njit
 
 from tpcd.qp import compiled
-from tpcd.simulator import (
-    kernel_element,
-    kernel_geometry,
-    kernel_linear,
-    kernel_request,
-    kernel_settle,
-    kernel_slopes,
-    kernel_space,
-)
 from tpcd.simulator.kernel_element import step_element
 from tpcd.simulator.kernel_geometry import World, new_chains
 from tpcd.simulator.kernel_request import new_planes, own_law, prepare, set_planes, set_stiffness
 from tpcd.simulator.kernel_slopes import SceneSlopes, new_slopes
 from tpcd.simulator.kernel_space import new_space
-
-_PARTS = (
-    kernel_element,
-    kernel_geometry,
-    kernel_linear,
-    kernel_request,
-    kernel_settle,
-    kernel_slopes,
-    kernel_space,
-    compiled,
-)
 
 
 def source_stamp(*more: ModuleType) -> int:
@@ -57,8 +37,8 @@ def source_stamp(*more: ModuleType) -> int:
     files it calls must be part of the key, or old code would run.
     """
     digest = hashlib.sha256()
-    own = sys.modules[__name__]
-    for module in (own, *_PARTS, *more):
+    parts = [part for name, part in sorted(sys.modules.items()) if name.startswith(__name__)]
+    for module in (*parts, compiled, *more):
         digest.update(Path(str(module.__file__)).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")
 

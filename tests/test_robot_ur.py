@@ -153,6 +153,8 @@ def test_a_command_outside_of_the_workspace_is_refused_where_it_stands(
 
 def test_ctrl_c_in_a_move_retreats_and_keeps_it(emulator, tmp_path: Path) -> None:
     arm = arm_on(emulator, tmp_path)
+    # A shell starts what runs in the background with Ctrl-C ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         x, z, _ = arm.start().poses[0].tolist()
 
@@ -166,6 +168,7 @@ def test_ctrl_c_in_a_move_retreats_and_keeps_it(emulator, tmp_path: Path) -> Non
             arm.settle(command(x + 0.1, z - 0.06))
         assert arm.at_rest == "the arm has retreated"
     finally:
+        signal.signal(signal.SIGINT, before)
         arm.stop()
         arm.close()
     columns, about = raw_of(tmp_path, "row_001")

@@ -167,6 +167,8 @@ def test_ctrl_c_in_a_move_retreats_and_keeps_it(emulator, tmp_path: Path) -> Non
         with pytest.raises(KeyboardInterrupt):
             arm.settle(command(x + 0.1, z - 0.06))
         assert arm.at_rest == "the arm has retreated"
+        with pytest.raises(RobotError, match="has retreated since it was stopped"):
+            arm.settle(command(x, z))
     finally:
         signal.signal(signal.SIGINT, before)
         arm.stop()
@@ -281,6 +283,27 @@ class StubLink(Link):
 
     def next_sample(self) -> Sample:
         return self._samples.pop(0)
+
+    def servo(self, target: object) -> None:
+        pass
+
+
+def test_the_force_limit_holds_again_after_a_retreat_that_fails() -> None:
+    frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
+    place = np.array([0.1, 0.1, 0.0])
+    tcp = tcp_pose(frame, place)
+    forces = (25.0, 40.0, 25.0, 25.0)
+    samples = [
+        Sample(0.008 * k, tcp, np.array([0.0, 0.0, force, 0.0, 0.0, 0.0]), tcp, 0.0)
+        for k, force in enumerate(forces)
+    ]
+    servo = Servo(ArmSettings("nowhere"), StubLink(samples), frame, RawRecord())
+    servo.state = at_rest(place, np.zeros(3))
+    with pytest.raises(RobotError, match="met a force of 40"):
+        servo.retreat()
+    with pytest.raises(RobotError, match="beyond the limit of 20 N"):
+        for _ in range(2):
+            servo.read()
 
 
 @pytest.mark.parametrize(

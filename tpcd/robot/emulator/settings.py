@@ -43,7 +43,7 @@ class EmulatorSettings:
     surface_mm_per_10n: float = 2.0
     """How far floor and wall yield under 10 N [mm]."""
     x_axis: str = "+x"
-    """Axis of the base that is x of the task."""
+    """Axis of the base that is x of the task; z is up."""
     origin: tuple[float, float, float] = (0.4, 0.0, 0.1)
     """Origin of the task in the base frame [m]."""
     payload: float = 0.5

@@ -19,6 +19,8 @@ class Predict:
     """Episodes to predict, one or more."""
     out: Path
     """CSV file for the predictions."""
+    model: Path | None = None
+    """A model.yaml whose effects join the belief, drawn from what it says was found."""
     rollout: bool = False
     """Start at row 0 and feed on own predictions, instead of on every measured pose."""
     of: Literal["measured", "true"] = "measured"
@@ -26,7 +28,7 @@ class Predict:
     particles: int = 400
     """Particles used for prediction."""
     seed: int = 0
-    """Seed of the rollout's random numbers."""
+    """Seed of the random numbers of rollouts and of the model's effects."""
     overwrite: bool = False
     """Replace an existing file."""
 
@@ -38,7 +40,9 @@ def predict_episodes(config: Predict) -> None:
     """Predict every row of the episodes from the row before and print error and coverage."""
     import torch
 
+    from tpcd.belief.augmented import with_model
     from tpcd.belief.storage import load_belief
+    from tpcd.commands.kept_model import model_of
     from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
@@ -56,6 +60,7 @@ def predict_episodes(config: Predict) -> None:
     torch.set_num_threads(1)
     check_target(config.out, config.overwrite)
     episodes = [read_episode(path) for path in config.episodes]
+    model = model_of(config.model)
     belief = load_belief(config.run)
     for path, episode in zip(config.episodes, episodes, strict=True):
         if not torch.allclose(episode.stiffness, belief.stiffness):
@@ -65,8 +70,16 @@ def predict_episodes(config: Predict) -> None:
                 f"{belief.stiffness.tolist()}",
                 "predict episodes recorded with the same controller",
             )
-    predictor = ContactPredictor(belief, config.particles)
     generator = torch.Generator().manual_seed(config.seed)
+    if config.model is not None:
+        try:
+            belief = with_model(belief, model, generator)
+        except ValueError as error:
+            raise RunError(config.run, str(error), f"leave {config.model} out") from error
+        for effect in model.effects:
+            source = "what was found" if effect.name in model.found else "its prior"
+            print(f"{effect.name} is drawn from {source} in {config.model}")
+    predictor = ContactPredictor(belief, config.particles)
     predicted: list[PredictedRows] = []
     for episode in episodes:
         if config.rollout:

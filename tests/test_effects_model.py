@@ -1,52 +1,38 @@
-"""Model files and effects of one's own: the example of the docs, and all that can go wrong."""
+"""Effects of one's own, from the docs to estimates, predictions and commands."""
 
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from command_calls import PRIOR, ROOT, call
-from torch import Tensor
+from command_calls import PRIOR, call
+from effect_cases import SHAPE, block, draws_of, likelihood, make_episode
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.belief import Belief, prior_belief
-from tpcd.belief.history import History, history_of
-from tpcd.belief.likelihood import history_likelihood
+from tpcd.belief.history import history_of
 from tpcd.belief.misfit import MisfitField
-from tpcd.belief.prior import make_prior
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.data.episode import Episode, write_episode
-from tpcd.effects import CATALOGUE, DeclaredEffect, Effect, EffectParameter
+from tpcd.effects import CATALOGUE, Effect
 from tpcd.effects.check import check_effect
-from tpcd.effects.model import Model, load_effects, load_model, write_model
+from tpcd.effects.model import load_effects, load_model
 from tpcd.effects.protocol import Added
 from tpcd.effects.truth import EffectTruth, added_effects
-from tpcd.errors import EffectError, ModelError
+from tpcd.errors import ModelError
 from tpcd.exploration import Estimator
-from tpcd.parameters import Parameters
 from tpcd.predict import ContactPredictor
 from tpcd.results import to_plain
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings, native
-from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
 
-DOCS = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
 STIFFNESS = torch.tensor([100.0, 100.0, 50.0], dtype=torch.float64)
 BOX = torch.tensor([[-0.05, 0.0], [0.05, 0.0], [0.05, 0.1], [-0.05, 0.1]]).double()
-SHAPE = PolygonShape(builtin_outlines()["mug"])
 FEW = SamplerSettings(particles=32, draws=200, prior_draws=100, places=10, fresh_modes=8)
-
-
-def block(language: str) -> str:
-    """The one block of a language in the docs."""
-    (found,) = re.findall(rf"```{language}\n(.*?)```", DOCS, re.DOTALL)
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -65,29 +51,7 @@ def wet(folder: Path) -> Effect:
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
-    generator = torch.Generator().manual_seed(3)
-    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
-    motion = make_motion("diagnosis", scene, 6, generator)
-    return record(make_truth(scene, "quasistatic"), scene, motion, 6, generator).measured
-
-
-def likelihood(history: History, draws: Tensor, added: Added | None) -> Tensor:
-    sd = torch.full((len(draws),), 5e-4, dtype=torch.float64)
-    parameters, field = Parameters.from_vector(draws), MisfitField(5e-4)
-    return history_likelihood(
-        SHAPE, parameters, sd, history, field, StepSettings(), added=added
-    ).total
-
-
-def draws_of(count: int) -> Tensor:
-    prior = make_prior(SHAPE)
-    return prior.to_vector(prior.sample(count, torch.Generator().manual_seed(1)))
-
-
-def one_line(error: BaseException) -> str:
-    line = str(error)
-    assert "\n" not in line
-    return line
+    return make_episode()
 
 
 def test_the_example_of_the_docs_is_a_model(folder: Path) -> None:
@@ -161,14 +125,6 @@ def test_a_belief_whose_effects_changed_is_refused(
         load_belief(tmp_path, SHAPE)
 
 
-def test_models_come_back_as_they_were_written(folder: Path, tmp_path: Path) -> None:
-    model = load_model(folder / "model.yaml")
-    again = load_model(write_model(model, tmp_path / "deep.yaml", notes="by hand"))
-    assert again.step == model.step
-    assert [to_plain(effect) for effect in again.effects] == to_plain(model.effects)
-    assert load_model(write_model(Model(), tmp_path / "none.yaml")) == Model()
-
-
 def test_settings_with_effects_are_plain_and_readable(wet: Effect) -> None:
     plain = to_plain(EstimatorSettings(effects=(wet, CATALOGUE[0])))
     assert plain["effects"][1] == {
@@ -176,177 +132,6 @@ def test_settings_with_effects_are_plain_and_readable(wet: Effect) -> None:
         "parameters": {"compliance": [0.0, 8e-4]},
     }
     json.dumps(plain)
-
-
-FAULTS = {
-    "no file": (None, "no such file"),
-    "a folder": ("", "cannot be read"),
-    "no YAML": ("effects: [", "cannot be read"),
-    "a list": ("- floor_tilt", "is not a mapping"),
-    "another key": ("effect: []", "has 'effect'"),
-    "no list": ("effects: floor_tilt", "expected a list"),
-    "no name": ("effects: [floor_tilt]", "expected at least 'name: ...'"),
-    "an unknown key": (
-        "effects: [{name: floor_tilt, prior: [0, 1]}]",
-        "expected name, file and parameters",
-    ),
-    "unknown effect": ("effects: [{name: floor_till}]", "no effect 'floor_till'; expected one of"),
-    "unknown parameter": (
-        "effects: [{name: floor_tilt, parameters: {slope: [0, 1]}}]",
-        "effect 'floor_tilt' has no 'slope'; expected angle",
-    ),
-    "twice": ("effects: [{name: floor_tilt}, {name: floor_tilt}]", "'floor_tilt' twice"),
-    "no width": ("effects: [{name: floor_tilt, parameters: {angle: [1, 1]}}]", "low < high"),
-    "infinite": ("effects: [{name: floor_tilt, parameters: {angle: [0, .inf]}}]", "finite"),
-    "one end": (
-        "effects: [{name: floor_tilt, parameters: {angle: [1]}}]",
-        "prior of floor_tilt.angle is [1], expected [low, high]",
-    ),
-    "a word": ("effects: [{name: floor_tilt, parameters: {angle: [0, steep]}}]", "[low, high]"),
-    "a number": ("effects: [{name: floor_tilt, parameters: {angle: 3}}]", "is 3, expected [low"),
-    "no mapping": ("effects: [{name: floor_tilt, parameters: 3}]", "expected 'name: [low, high]'"),
-    "unknown step": ("step: {parts: 3}", "expected any of friction, substeps"),
-    "bad step": ("step: {substeps: 0}", "must both be at least 1"),
-    "no effects file": ("effects: [{name: a, file: nowhere.py}]", "nowhere.py: no such file"),
-    "no EFFECTS": ("effects: [{name: a, file: empty.py}]", "empty.py: holds no EFFECTS"),
-    "failing file": (
-        "effects: [{name: a, file: failing.py}]",
-        "failing.py: fails when it is run: ZeroDivisionError: division by zero",
-    ),
-    "no Python": ("effects: [{name: a, file: broken.py}]", "fails when it is run: SyntaxError"),
-    "no effect": ("effects: [{name: a, file: other.py}]", "EFFECTS holds 3"),
-    "other name": (
-        "effects: [{name: dry_floor, file: my_effects.py}]",
-        "expected one of wet_floor",
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_bad_models_are_refused_in_one_line(folder: Path, tmp_path: Path, fault: str) -> None:
-    text, told = FAULTS[fault]
-    (tmp_path / "my_effects.py").write_text(block("python"))
-    (tmp_path / "empty.py").write_text("x = 1\n")
-    (tmp_path / "failing.py").write_text("1 / 0\n")
-    (tmp_path / "broken.py").write_text("def f(:\n")
-    (tmp_path / "other.py").write_text("EFFECTS = (3,)\n")
-    path = tmp_path if text == "" else tmp_path / "model.yaml"
-    if text:
-        path.write_text(text)
-    with pytest.raises(ModelError) as caught:
-        load_model(path)
-    assert told in one_line(caught.value)
-    assert str(tmp_path) in str(caught.value)
-
-
-SPOILT = {
-    "not null": ("torch.exp(log_ratio * beyond)", "1.0 + torch.exp(log_ratio * beyond)"),
-    "mixes": ("(x - edge)", "(x - edge.mean())"),
-    "no passes": ("        passes=1,\n", ""),
-    "no text": ("{1}", "{2}"),
-    "site": ('"contact tangent"', '"contact"'),
-    "raises": ("    x = ", "    raise RuntimeError('on\\npurpose')\n    x = "),
-    "nothing": ("    return replace(conditions, friction=conditions.friction * ratio)", "    pass"),
-    "shape": ("conditions.friction * ratio", "ratio[..., 0]"),
-    "dtype": ("conditions.friction * ratio", "(conditions.friction * ratio).float()"),
-    "null": ("null=0.05", "null=0.5"),
-}
-TOLD = {
-    "not null": "changes friction at the null values",
-    "mixes": "mixes particles: friction of the first depends on the others",
-    "no passes": "expected 'passes' of 1 or more",
-    "no text": "expected {0}, {1}",
-    "site": "expected one of command, impedance",
-    "raises": "'wet_floor' fails with RuntimeError: on purpose",
-    "nothing": "'wet_floor'",
-    "shape": "'wet_floor'",
-    "dtype": "'wet_floor'",
-    "null": "null value 0.5 of 'edge' outside of its range",
-}
-
-
-@pytest.mark.parametrize("case", TOLD)
-def test_effects_that_break_their_promises_are_refused_when_read(tmp_path: Path, case: str) -> None:
-    before, after = SPOILT[case]
-    assert block("python").count(before) == 1
-    path = tmp_path / "own.py"
-    path.write_text(block("python").replace(before, after))
-    with pytest.raises(ModelError) as caught:
-        load_effects(path)
-    assert TOLD[case] in one_line(caught.value) and "own.py" in str(caught.value)
-
-
-def test_an_effect_may_not_come_twice_in_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "own.py"
-    path.write_text(block("python") + "\nEFFECTS = EFFECTS * 2\n")
-    with pytest.raises(ModelError, match="holds 'wet_floor' twice"):
-        load_effects(path)
-
-
-def rough(power: float, field: str = "friction") -> Effect:
-    """An effect that has no answer for negative values."""
-
-    def change(conditions, values, rows, outcome):
-        value = getattr(conditions, field)
-        factor = (values[:, 0] ** power).reshape(-1, *[1] * (value.ndim - 1))
-        return replace(conditions, **{field: value * factor})
-
-    return DeclaredEffect(
-        "rough", "contact tangent", (EffectParameter("size", "1", -1.0, 1.5, 1.0),), change, "{0}"
-    )
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("field", ["friction", "command", "stiffness", "normal", "bias"])
-def test_a_particle_without_an_answer_leaves_the_others_alone(
-    episode: Episode, compiled: bool, field: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not compiled:
-        monkeypatch.setattr(native, "available", lambda: False)
-    values = torch.tensor([-0.5, 1.0, 0.9, -0.1, 1.2, 1.0], dtype=torch.float64)[:, None]
-    fine = values[:, 0] > 0
-    rows = episode if compiled else episode.first(3)
-    effect, history, draws = rough(0.5, field), history_of(rows), draws_of(6)
-    # A second effect looks at what the first one left behind.
-    pair = (effect, CATALOGUE[0])
-    values = torch.cat((values, torch.full_like(values, 2e-4)), dim=1)
-    found = likelihood(history, draws, Added(pair, values))
-    other = values.clone()
-    other[~fine, 0] = 1.0
-    expected = likelihood(history, draws, Added(pair, other))
-    assert torch.equal(found[fine], expected[fine])
-    assert bool((found[~fine] == -torch.inf).all())
-
-
-def test_a_stiffness_that_is_not_positive_counts_as_no_answer(episode: Episode) -> None:
-    values = torch.tensor([[1.0], [-1.0], [1.0]], dtype=torch.float64)
-    found = likelihood(history_of(episode), draws_of(3), Added((rough(1.0, "stiffness"),), values))
-    expected = likelihood(history_of(episode), draws_of(3), None)
-    assert torch.equal(found[[0, 2]], expected[[0, 2]])
-    assert float(found[1]) == -torch.inf
-
-
-def test_an_effect_that_never_has_an_answer_is_named(episode: Episode) -> None:
-    effect = replace(
-        rough(1.0), change=lambda c, v, r, o: replace(c, friction=c.friction * torch.nan)
-    )
-    values = torch.ones(3, 1, dtype=torch.float64)
-    with pytest.raises(EffectError, match="'rough' gives no usable friction for any value"):
-        likelihood(history_of(episode), draws_of(3), Added((effect,), values))
-    only_bad = rough(0.5)
-    found = likelihood(history_of(episode), draws_of(3), Added((only_bad,), -values))
-    assert bool((found == -torch.inf).all())
-
-
-def test_an_effect_that_fails_on_the_way_is_named(episode: Episode) -> None:
-    def change(conditions, values, rows, outcome):
-        raise IndexError("a cause\nof two lines")
-
-    effect = replace(rough(1.0), change=change, source="own.py")
-    with pytest.raises(EffectError) as caught:
-        likelihood(history_of(episode), draws_of(2), Added((effect,), torch.ones(2, 1).double()))
-    line = one_line(caught.value)
-    assert line == "effect 'rough' of own.py fails with IndexError: a cause of two lines"
 
 
 def belief_with(effects: dict[str, dict[str, float]], episode: Episode) -> Belief:

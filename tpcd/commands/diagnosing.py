@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 
+from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Cell, Diagnosis
@@ -79,9 +80,8 @@ def write_diagnosis(
     figures: dict[str, tuple[Figure, str]] = {}
     if diagnosis.belief is not None:
         belief = diagnosis.belief
-        write_model(
-            Model(belief.prior.effects, belief.step), folder / "model.yaml", diagnosis.sentence
-        )
+        model = Model(belief.prior.effects, belief.step, found_effects(belief))
+        write_model(model, folder / "model.yaml", diagnosis.sentence)
         save_belief(belief, folder, prior)
         figures = draw_diagnosis(diagnosis, episodes, least_gain)
     images = {}

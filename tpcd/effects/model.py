@@ -6,6 +6,8 @@ A YAML file:
       - name: floor_compliance           # from the catalogue
         parameters:                      # optional: narrower priors, SI units
           compliance: [1.0e-4, 4.0e-4]
+        found:                           # optional: mean and standard deviation, for predict
+          compliance: [2.1e-4, 1.6e-5]
       - name: magnet                     # an effect of your own
         file: my_effects.py              # relative to this file; holds EFFECTS = (...)
     step:                                # optional: settings of the step
@@ -18,9 +20,10 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +35,17 @@ from tpcd.effects.protocol import SITES, Effect, EffectParameter, effect_to_plai
 from tpcd.errors import EffectError, ModelError
 from tpcd.simulator.record import StepSettings
 
+Found = Mapping[str, Mapping[str, tuple[float, float]]]
+"""Mean and standard deviation [SI units] that data gave parameters of effects, by both names."""
+
 
 @dataclass(frozen=True)
 class Model:
-    """Effects and settings of the step."""
+    """Effects, settings of the step, and what is known of the effects."""
 
     effects: tuple[Effect, ...] = ()
     step: StepSettings = StepSettings()
+    found: Found = field(default_factory=dict)
 
 
 def load_model(path: str | Path) -> Model:
@@ -57,20 +64,25 @@ def load_model(path: str | Path) -> Model:
         raise ModelError(path, f"has {unknown[0]!r}", "expected 'effects', 'step' and 'notes'")
     effects = effects_from_plain(content.get("effects") or [], path)
     given = content.get("step") or {}
-    known = [field.name for field in fields(StepSettings)]
+    known = [setting.name for setting in fields(StepSettings)]
     if not isinstance(given, Mapping) or set(given) - set(known):
         raise ModelError(path, f"step is {given!r}", f"expected any of {', '.join(known)}")
     try:
         step = StepSettings(**given)
     except (TypeError, ValueError) as error:
         raise ModelError(path, f"step: {error}") from error
-    return Model(effects, step)
+    return Model(effects, step, _found_of(content.get("effects") or [], effects, path))
 
 
 def write_model(model: Model, path: str | Path, notes: str | None = None) -> Path:
     """Write a model file."""
     path = Path(path)
-    content: dict[str, Any] = {"effects": effects_to_plain(model.effects)}
+    plain = effects_to_plain(model.effects)
+    for one in plain:
+        if one["name"] in model.found:
+            found = model.found[one["name"]]
+            one["found"] = {name: [float(value) for value in pair] for name, pair in found.items()}
+    content: dict[str, Any] = {"effects": plain}
     step = {k: v for k, v in asdict(model.step).items() if v != getattr(StepSettings(), k)}
     if step:
         content["step"] = step
@@ -101,9 +113,9 @@ def effects_from_plain(plain: Any, path: Path) -> tuple[Effect, ...]:
     for entry in plain:
         if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
             raise ModelError(path, f"has the effect {entry!r}", "expected at least 'name: ...'")
-        if set(entry) - {"name", "file", "parameters", "sha256"}:
+        if set(entry) - {"name", "file", "parameters", "found", "sha256"}:
             raise ModelError(
-                path, f"has the effect {dict(entry)!r}", "expected name, file and parameters"
+                path, f"has the effect {dict(entry)!r}", "expected name, file, parameters and found"
             )
         own: Iterable[Effect] = CATALOGUE
         if entry.get("file"):
@@ -198,3 +210,29 @@ def _with_priors(effect: Effect, given: Any) -> Effect:
             ) from None
         parameters.append(replace(parameter, low=low, high=high))
     return replace(effect, parameters=tuple(parameters))  # type: ignore[type-var]
+
+
+def _found_of(plain: Any, effects: Sequence[Effect], path: Path) -> Found:
+    """What the entries of a model file say of their effects' sizes; raises `ModelError`."""
+    known: dict[str, dict[str, tuple[float, float]]] = {}
+    for entry, effect in zip(plain, effects, strict=True):
+        given = entry.get("found")
+        if given is None:
+            continue
+        names = [parameter.name for parameter in effect.parameters]
+        if not isinstance(given, Mapping) or sorted(given) != sorted(names):
+            raise ModelError(
+                path, f"found of {effect.name!r} is {given!r}", f"expected {', '.join(names)}"
+            )
+        known[effect.name] = {}
+        for name, pair in given.items():
+            try:
+                mean, std = (float(value) for value in pair)
+            except (TypeError, ValueError):
+                mean, std = math.nan, math.nan
+            if not (math.isfinite(mean) and 0 <= std < math.inf):
+                raise ModelError(
+                    path, f"found of {effect.name}.{name} is {pair!r}", "expected [mean, sd >= 0]"
+                )
+            known[effect.name][name] = (mean, std)
+    return known

@@ -96,7 +96,7 @@ def evaluate_unseen(config: Unseen) -> None:
 
     from tpcd.figures.quality import calibration, error_bars
     from tpcd.figures.sinks import save_figure
-    from tpcd.predict import CHANNELS
+    from tpcd.prediction import CHANNELS
     from tpcd.results import continue_run, format_table, open_run, write_results
     from tpcd.shape.ycb import load_ycb
 
@@ -153,7 +153,8 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
 
     from eval.scoring import score_tests
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
-    from tpcd.predict import CHANNELS, ContactPredictor
+    from tpcd.predict import ContactPredictor
+    from tpcd.prediction import CHANNELS
     from tpcd.shape.checkpoint import load_prior
     from tpcd.truth.recording import make_motion, record
     from tpcd.truth.scene import draw_scene, make_truth

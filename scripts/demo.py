@@ -70,7 +70,8 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     from tpcd.figures.quality import calibration
     from tpcd.figures.sinks import save_figure
     from tpcd.policies import ActivePolicy, Limits
-    from tpcd.predict import CHANNELS, ContactPredictor
+    from tpcd.predict import ContactPredictor
+    from tpcd.prediction import CHANNELS
     from tpcd.results import format_table, write_results
     from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines

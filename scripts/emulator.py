@@ -39,7 +39,8 @@ def emulate(config: Emulation) -> None:
     import torch
     import yaml
 
-    from tpcd.results import check_target, write_text
+    from tpcd.files import write_text
+    from tpcd.results import check_target
     from tpcd.robot.emulator import emulated_scene
     from tpcd.robot.emulator.server import Server
 

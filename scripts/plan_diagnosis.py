@@ -111,7 +111,8 @@ def _plan(config: Planning) -> None:
 
     import torch
 
-    from tpcd.results import check_target, write_text
+    from tpcd.files import write_text
+    from tpcd.results import check_target
     from tpcd.truth.diagnosis_plan import diagnosis_plan
 
     assert config.out is not None

@@ -130,9 +130,10 @@ def simulate(config: Simulation) -> None:
     import torch
 
     from tpcd.data.episode import write_together
+    from tpcd.files import to_plain
     from tpcd.parameters import SCENE_NAMES
     from tpcd.random import stream
-    from tpcd.results import check_target, to_plain
+    from tpcd.results import check_target
     from tpcd.shape.named import find_outline
     from tpcd.truth.recording import make_motion, record, recording_contents
     from tpcd.truth.scene import draw_scene, make_truth

@@ -11,7 +11,7 @@ import yaml
 
 from tpcd.cli import check_numbers, parse, run
 from tpcd.errors import RunError
-from tpcd.results import to_plain
+from tpcd.files import to_plain
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from tpcd.effects.protocol import Added
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.errors import ModelError
 from tpcd.exploration import Estimator
+from tpcd.files import to_plain
 from tpcd.predict import ContactPredictor
-from tpcd.results import to_plain
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings, native

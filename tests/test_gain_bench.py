@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from eval.bench.gain import Benchmark, benchmark
-from tpcd.results import read_json
+from tpcd.files import read_json
 
 
 def test_the_quick_run_times_choices_and_compares_rankings(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from tpcd.information import (
 )
 from tpcd.information.gain import cubature_points
 from tpcd.information.outcomes import reading_variance
-from tpcd.predict import Prediction
+from tpcd.prediction import Prediction
 
 
 def linear_outcomes(

@@ -9,7 +9,7 @@ from effect_cases import block, one_line
 
 from tpcd.effects.model import Model, load_effects, load_model, write_model
 from tpcd.errors import ModelError
-from tpcd.results import to_plain
+from tpcd.files import to_plain
 
 
 def test_models_come_back_as_they_were_written(tmp_path: Path) -> None:

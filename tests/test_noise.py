@@ -12,7 +12,8 @@ import torch
 from scipy.stats import chi2
 
 from tpcd.data.episode import Episode, write_episode
-from tpcd.data.noise import check_noise, estimate_noise, read_noisy, resolution
+from tpcd.data.noise import check_noise, estimate_noise, resolution
+from tpcd.data.noisy import read_noisy
 from tpcd.effects import CATALOGUE
 from tpcd.errors import EpisodeError
 from tpcd.random import stream

@@ -16,8 +16,8 @@ from eval.bench.contact_problems import ContactRecipe, random_contact_problems
 from eval.bench.qp import Benchmark, benchmark
 from eval.bench.qp_solvers import available_solvers, reference_forces
 from tpcd.errors import RunError
+from tpcd.files import read_json
 from tpcd.qp import solve
-from tpcd.results import read_json
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -13,15 +13,8 @@ import torch
 import yaml
 
 from tpcd.errors import FileError, RunError
-from tpcd.results import (
-    check_target,
-    format_table,
-    open_run,
-    read_json,
-    run_folder,
-    write_json,
-    write_results,
-)
+from tpcd.files import read_json, write_json
+from tpcd.results import check_target, format_table, open_run, run_folder, write_results
 
 
 @dataclass(frozen=True)

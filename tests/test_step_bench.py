@@ -7,7 +7,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from eval.bench.figures import step_seconds
 from eval.bench.step import Benchmark, benchmark, fastest
-from tpcd.results import read_json
+from tpcd.files import read_json
 
 
 def test_the_quick_run_times_every_part_and_draws_the_curve(tmp_path, capsys):

@@ -18,7 +18,8 @@ from eval.blind.score import Score, confusion, median_interval, rate, share_inte
 from eval.blind.suites import CLEAN, SUITES
 from tpcd.figures.sinks import save_figure
 from tpcd.figures.style import TEXT, panels, title
-from tpcd.results import format_table, write_text
+from tpcd.files import write_text
+from tpcd.results import format_table
 
 Row = dict[str, Any]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from tpcd.data import Episode, read_episode, write_episode
 from tpcd.errors import RunError
-from tpcd.results import read_json, write_json
+from tpcd.files import read_json, write_json
 
 MAIN, FRESH = "main", "fresh"
 

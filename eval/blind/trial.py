@@ -16,7 +16,7 @@ from eval.blind.suites import Case
 from eval.lines import read_lines
 from tpcd.data import Episode
 from tpcd.discrepancy.diagnosis import Diagnosis
-from tpcd.results import to_plain
+from tpcd.files import to_plain
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.protocol import Shape
 

@@ -16,7 +16,8 @@ from tpcd.figures.predictions import prediction as prediction_figure
 from tpcd.figures.quality import calibration, error_bars
 from tpcd.figures.sinks import ImageWriter, save_figure
 from tpcd.figures.style import SERIES, legend_below, panels
-from tpcd.predict import CHANNELS, ContactPredictor
+from tpcd.predict import ContactPredictor
+from tpcd.prediction import CHANNELS
 
 POLICIES = ("active", "random", "expert", "lookahead", "grid", "rich")
 """Each has a colour of its own, whoever estimates."""

@@ -22,7 +22,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.effects.model import effects_from_plain, effects_to_plain
 from tpcd.errors import RunError
-from tpcd.results import read_json, write_json
+from tpcd.files import read_json, write_json
 from tpcd.shape.checkpoint import find_prior, load_prior
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings

@@ -22,8 +22,9 @@ from tpcd.effects.model import Model, write_model
 from tpcd.errors import RunError
 from tpcd.figures.diagnosis import evidence_bars, gap_bars, residual_map, theta_shift, worst_stretch
 from tpcd.figures.sinks import save_figure
+from tpcd.files import read_json, write_json
 from tpcd.predict import ContactPredictor
-from tpcd.results import RESULTS_FILE, continue_run, read_json, run_folder, write_json
+from tpcd.results import RESULTS_FILE, continue_run, run_folder
 from tpcd.versions import versions
 
 EXIT_CODES = {

@@ -29,7 +29,7 @@ from tpcd.figures.outline import outline_belief
 from tpcd.figures.progress import estimation_progress
 from tpcd.figures.scene import scene as scene_figure
 from tpcd.figures.sinks import save_figure
-from tpcd.results import write_json
+from tpcd.files import write_json
 
 STILL_PRIOR = 0.85
 """A 90 % interval wider than this share of the prior's counts as nothing learnt."""

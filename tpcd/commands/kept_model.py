@@ -10,7 +10,7 @@ import yaml
 
 from tpcd.effects.model import Model, effects_to_plain, load_model
 from tpcd.errors import RunError
-from tpcd.results import write_text
+from tpcd.files import write_text
 
 MODEL_FILE = "model.yaml"
 

@@ -18,9 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.data.episode import Episode
+from tpcd.files import write_text
 from tpcd.planar import wrap_angle
-from tpcd.predict import CHANNELS, ContactPredictor, Prediction
-from tpcd.results import write_text
+from tpcd.predict import ContactPredictor
+from tpcd.prediction import CHANNELS, Prediction
 
 CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
 ROLLOUT_SAMPLES = 400

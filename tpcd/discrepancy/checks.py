@@ -16,7 +16,8 @@ from tpcd.data.checks import check_episode
 from tpcd.data.episode import Episode, locate
 from tpcd.data.header import Header, read_header
 from tpcd.data.measured import read_measured
-from tpcd.data.noise import check_noise, read_noisy
+from tpcd.data.noise import check_noise
+from tpcd.data.noisy import read_noisy
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.errors import EpisodeError
 

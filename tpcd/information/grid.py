@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.predict import Prediction
+from tpcd.prediction import Prediction
 
 _ROWS_AT_ONCE = 256
 """Outcomes compared with all particles at once: as many as stay in the cache."""

@@ -16,7 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.predict import ContactPredictor, Prediction
+from tpcd.predict import ContactPredictor
+from tpcd.prediction import Prediction
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.predict import Prediction
+from tpcd.prediction import Prediction
 
 
 @dataclass(frozen=True)

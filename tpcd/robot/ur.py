@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tpcd.data.episode import Episode
 from tpcd.errors import RobotError
-from tpcd.results import read_json, write_json
+from tpcd.files import read_json, write_json
 from tpcd.robot import preflight
 from tpcd.robot.admittance import at_rest
 from tpcd.robot.arm_settings import ArmSettings

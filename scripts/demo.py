@@ -56,7 +56,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
-    from tpcd.commands.estimation import KnownTruth
+    from tpcd.commands.drawing import KnownTruth
     from tpcd.commands.exploring import EPISODE_NAME, Stopping, run_exploration
     from tpcd.commands.prediction import (
         PredictedRows,

@@ -50,9 +50,10 @@ def estimate_episode(config: Estimate) -> None:
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
     from tpcd.belief.state import STATE_FILE, load_state
-    from tpcd.commands.estimation import parameter_rows, run_estimation
+    from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
     from tpcd.commands.plausibility import check_start_pose
+    from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
     from tpcd.results import continue_run, format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior

@@ -45,7 +45,7 @@ def explore_object(config: Exploration) -> None:
     import torch
 
     from tpcd.belief.state import STATE_FILE
-    from tpcd.commands.estimation import KnownTruth
+    from tpcd.commands.drawing import KnownTruth
     from tpcd.commands.exploring import EPISODE_NAME, Stage, explore_in_folder
     from tpcd.policies import make_policy
     from tpcd.random import stream

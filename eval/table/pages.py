@@ -10,7 +10,8 @@ import numpy as np
 
 from eval.table.cells import Cell, Outcome
 from eval.table.summary import Row, curves, label, summarise
-from tpcd.commands.estimation import KnownTruth, draw_estimation, step_row
+from tpcd.commands.drawing import KnownTruth, draw_estimation
+from tpcd.commands.estimation import step_row
 from tpcd.commands.prediction import measured_rows, predict_rows
 from tpcd.figures.predictions import prediction as prediction_figure
 from tpcd.figures.quality import calibration, error_bars

@@ -12,41 +12,24 @@ import math
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from tpcd.belief.belief import Belief, EstimationStep, weighted_quantile
+from tpcd.belief.belief import Belief, EstimationStep
 from tpcd.belief.state import save_state
 from tpcd.belief.storage import load_belief, save_belief
-from tpcd.contact import place_points
+from tpcd.commands.drawing import KnownTruth, draw_estimation
+from tpcd.commands.summary import prior_summary, summarise
 from tpcd.data.episode import Episode
-from tpcd.figures.outline import outline_belief
-from tpcd.figures.progress import estimation_progress
-from tpcd.figures.scene import scene as scene_figure
-from tpcd.figures.sinks import save_figure
 from tpcd.files import write_json
 
-STILL_PRIOR = 0.85
-"""A 90 % interval wider than this share of the prior's counts as nothing learnt."""
-OUTLINES_DRAWN = 200
 STEPS_FILE = "steps.jsonl"
 FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
-
-
-@dataclass(frozen=True)
-class KnownTruth:
-    """What a simulation knows and an estimator does not; drawn beside the belief."""
-
-    vertices_ee: Tensor
-    scene: dict[str, float]
 
 
 def run_estimation(
@@ -160,61 +143,6 @@ def _earlier_rows(path: Path, done: int) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
-def summarise(belief: Belief) -> dict[str, Any]:
-    """Mean, 90 % interval, unit and whether it is still the prior, for each parameter."""
-    _, prior_low, prior_high = prior_summary(belief)
-    low, high = belief.quantile(0.05), belief.quantile(0.95)
-    mean, std = belief.mean(), belief.std()
-    entries = {}
-    for i, (name, unit) in enumerate(zip(belief.prior.names, belief.prior.units, strict=True)):
-        width = float(high[i] - low[i]) / float(prior_high[i] - prior_low[i])
-        entries[name] = {
-            "mean": float(mean[i]),
-            "std": float(std[i]),
-            "interval_90": [float(low[i]), float(high[i])],
-            "unit": unit,
-            "still_the_prior": width > STILL_PRIOR,
-        }
-    return {
-        "parameters": entries,
-        "log_evidence": belief.log_evidence,
-        "log_evidence_std": belief.log_evidence_std,
-        "outline_misfit_sd": {
-            "mean": float(belief.weights @ belief.misfit_sd),
-            "interval_90": [
-                float(weighted_quantile(belief.misfit_sd, belief.weights, level))
-                for level in (0.05, 0.95)
-            ],
-            "unit": "m",
-        },
-        "particles": len(belief.weights),
-    }
-
-
-def parameter_rows(belief: Belief) -> list[dict[str, Any]]:
-    """The table of theta that a command prints, one row for each parameter."""
-    return [
-        {
-            "parameter": name,
-            "mean": entry["mean"],
-            "low 5 %": entry["interval_90"][0],
-            "high 95 %": entry["interval_90"][1],
-            "unit": entry["unit"],
-            "learnt": "still the prior" if entry["still_the_prior"] else "yes",
-        }
-        for name, entry in summarise(belief)["parameters"].items()
-    ]
-
-
-def prior_summary(belief: Belief) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and ends of the 90 % interval of every entry of theta before any datum."""
-    prior = belief.prior
-    draws = prior.to_vector(prior.sample(4000, torch.Generator().manual_seed(0)))
-    levels = torch.tensor([0.05, 0.95], dtype=torch.float64)
-    low, high = torch.quantile(draws, levels, dim=0)
-    return draws.mean(0), low, high
-
-
 def _learnt_most(before: Belief | None, now: Belief) -> str:
     """The parameter whose spread shrank most in this step."""
     names, std = now.prior.names, now.std()
@@ -253,77 +181,3 @@ def _log_scalars(writer: Any, row: dict[str, Any], step: EstimationStep) -> None
     ):
         writer.add_scalar(f"mean/{name}", float(mean), step.index)
         writer.add_scalar(f"std/{name}", float(std), step.index)
-
-
-def _shown(belief: Belief) -> tuple[list[str], list[str], Any]:
-    """Labels and units of the entries of theta without the latent, as figures show them, and
-    factors from SI units; effects choose their own units."""
-    prior = belief.prior
-    z, scene = prior.shape.latent_dim, prior.scene_dimension
-    labels, units = list(prior.names[z:scene]), list(prior.units[z:scene])
-    factors = [1.0] * len(labels)
-    for effect in prior.effects:
-        for parameter in effect.parameters:
-            labels.append(f"{effect.name}:\n{parameter.name}")
-            units.append(parameter.shown_unit or parameter.unit)
-            factors.append(parameter.shown_factor)
-    return labels, units, torch.tensor(factors).double().numpy()
-
-
-def draw_estimation(
-    belief: Belief,
-    history: list[dict[str, Any]],
-    episode: Episode,
-    folder: Path,
-    writer: Any,
-    truth: KnownTruth | None,
-    prefix: str = "",
-    heading: str = "figures",
-) -> None:
-    """Figures of what was learnt: parameters step by step, the outline, and the scene.
-
-    `prefix` leads their names, `heading` is where TensorBoard shows them.
-    """
-    z = belief.prior.shape.latent_dim
-    names = belief.prior.names[z:]
-    columns = {
-        key: torch.cat((before[None], torch.tensor([row[key] for row in history])))[:, z:].numpy()
-        for key, before in zip(("mean", "low", "high"), prior_summary(belief), strict=True)
-    }
-    known = None
-    if truth is not None:
-        # A simulated scene says nothing of effects.
-        known = torch.tensor([truth.scene.get(name, math.nan) for name in names]).numpy()
-    last = len(history)
-    labels, units, factors = _shown(belief)
-    figure = estimation_progress(
-        torch.arange(last + 1).numpy(),
-        **{key: column * factors for key, column in columns.items()},
-        names=labels,
-        units=units,
-        truth=known,
-    )
-    save_figure(figure, folder, f"{prefix}estimation", writer, last, heading)
-    chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()
-    parameters = belief.parameters
-    with torch.no_grad():
-        outline = belief.prior.shape.boundary_points(parameters.latent[chosen])
-    points = place_points(outline, parameters.scale[chosen], parameters.mount[chosen])
-    vertices = None if truth is None else truth.vertices_ee.numpy()
-    figure = outline_belief(points.double().numpy(), belief.weights[chosen].numpy(), vertices)
-    save_figure(figure, folder, f"{prefix}outline", writer, last, heading)
-    surfaces = {}
-    for name in ("floor_height", "wall_position"):
-        i = names.index(name)
-        surfaces[name] = tuple(float(columns[key][-1, i]) for key in ("mean", "low", "high"))
-    central = points[int(belief.weights[chosen].argmax())].double().numpy()
-    figure = scene_figure(
-        episode.poses.numpy(),
-        central if vertices is None else vertices,
-        surfaces["floor_height"],
-        surfaces["wall_position"],
-        true_floor=None if truth is None else truth.scene["floor_height"],
-        true_wall=None if truth is None else truth.scene["wall_position"],
-        commands=episode.commands.numpy(),
-    )
-    save_figure(figure, folder, f"{prefix}scene", writer, last, heading)

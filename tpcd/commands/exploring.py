@@ -12,9 +12,11 @@ from tpcd.belief import EstimatorSettings
 from tpcd.belief.belief import Belief
 from tpcd.belief.state import load_state
 from tpcd.belief.storage import load_belief
-from tpcd.commands.estimation import EstimationRun, KnownTruth, parameter_rows
+from tpcd.commands.drawing import KnownTruth
+from tpcd.commands.estimation import EstimationRun
 from tpcd.commands.exploring_options import ExploringOptions
 from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
+from tpcd.commands.summary import parameter_rows
 from tpcd.data.episode import Episode, read_episode, write_together
 from tpcd.errors import RobotError
 from tpcd.exploration import Estimator, ExplorationStep, explore

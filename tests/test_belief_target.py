@@ -109,14 +109,15 @@ def test_compiled_derivatives_give_the_information_that_differences_give(
     assert (torch.linalg.eigvalsh(compiled)[:, 0] > 0).all()
 
 
+@pytest.mark.parametrize("power", [1.0, 0.5])
 def test_gradient_is_that_of_the_log_posterior(
-    prior: ParameterPrior, truth_and_episode: tuple[Tensor, Episode]
+    prior: ParameterPrior, truth_and_episode: tuple[Tensor, Episode], power: float
 ) -> None:
     """Up the gradient, scaled by the information, the log posterior rises nearly everywhere."""
     truth, episode = truth_and_episode
-    target: ContactTarget = ContactTarget(prior, MisfitField(1e-3, 1.0), StepSettings()).given(
-        history_of(episode)
-    )
+    target: ContactTarget = ContactTarget(
+        prior, MisfitField(1e-3, 1.0), StepSettings(), power=power
+    ).given(history_of(episode))
     noise = torch.randn(30, 8, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     score = torch.cat((truth, torch.zeros(1).double())) + 0.02 * noise
     gradient, information = target.curvature(score)
@@ -129,3 +130,23 @@ def test_gradient_is_that_of_the_log_posterior(
     expected = 1e-3 * (gradient * step).sum(-1)
     assert (gain > 0).double().mean() > 0.8
     assert float((gain / expected).median()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_power_scales_the_likelihood_and_its_threshold(
+    prior: ParameterPrior, truth_and_episode: tuple[Tensor, Episode]
+) -> None:
+    truth, episode = truth_and_episode
+    whole = ContactTarget(prior, MisfitField(1e-3, 1.0), StepSettings()).given(history_of(episode))
+    half = replace(whole, power=0.5)
+    noise = torch.randn(40, 8, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    score = torch.cat((truth, torch.zeros(1).double())) + 0.1 * noise
+    full = whole.log_likelihood(score, None)
+    torch.testing.assert_close(half.log_likelihood(score, None), 0.5 * full)
+    least = full.nan_to_num(neginf=0.0) + torch.linspace(-9.0, 9.0, 40).double()
+    kept = whole.log_likelihood(score, least)
+    assert 0 < int((kept == -torch.inf).sum()) < 40
+    torch.testing.assert_close(half.log_likelihood(score, 0.5 * least), 0.5 * kept)
+    # What data say is halved, what is known before them is not.
+    steep, flat = whole.curvature(score)[1], half.curvature(score)[1]
+    own = torch.eye(8).double()
+    torch.testing.assert_close(flat - own, 0.5 * (steep - own))

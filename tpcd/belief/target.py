@@ -32,6 +32,8 @@ class ContactTarget:
     misfit: MisfitField
     step: StepSettings
     history: History | None = None
+    power: float = 1.0
+    """Power to which the likelihood is raised."""
 
     def given(self, history: History) -> ContactTarget:
         """The same with a history."""
@@ -58,8 +60,9 @@ class ContactTarget:
     def log_likelihood(
         self, score: Float[Tensor, "m s"], least: Float[Tensor, " m"] | None
     ) -> Float[Tensor, " m"]:
-        """Log likelihood of the history; -inf where it may stay below `least`."""
-        return self.evaluate(score, least).total
+        """Log likelihood of the history, times the power; -inf where it may stay below `least`."""
+        least = None if least is None else least / self.power
+        return self.power * self.evaluate(score, least).total
 
     def curvature(
         self, score: Float[Tensor, "m s"]
@@ -73,8 +76,8 @@ class ContactTarget:
         here = torch.nan_to_num(found.whitened).flatten(1)
         slopes = torch.nan_to_num(found.slopes, 0.0, 0.0, 0.0).flatten(2)
         stretch = torch.nan_to_num(found.stretch, 0.0, 0.0, 0.0).flatten(2)
-        gradient = -(slopes @ here[..., None])[..., 0] - stretch.sum(-1)
-        information = slopes @ slopes.mT + 2 * stretch @ stretch.mT
+        gradient = self.power * (-(slopes @ here[..., None])[..., 0] - stretch.sum(-1))
+        information = self.power * (slopes @ slopes.mT + 2 * stretch @ stretch.mT)
         rise, precision = self.prior.curvature(score[:, :-1])
         information[:, :-1, :-1] += precision
         information[:, -1, -1] += 1.0

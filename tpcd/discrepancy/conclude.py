@@ -10,7 +10,7 @@ from tpcd.belief.belief import Belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
-from tpcd.discrepancy.evidence import Fit, posterior
+from tpcd.discrepancy.evidence import Fit, fit_model, posterior
 from tpcd.discrepancy.formula import FORMULAS
 from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors
 from tpcd.discrepancy.naming import Workbench
@@ -20,6 +20,12 @@ from tpcd.random import stream
 
 HALF = 0.5
 """Share of the gap that effects must close to be named where something else is left."""
+POWER = 0.6
+"""Power of the likelihood in the posterior that is reported. At 1 it is as narrow as a true model
+and endless draws would make it, and holds too few of the true sizes (coarsened posteriors: Miller
+and Dunson 2019); evidence, which compares models, is taken at 1."""
+SEEDS = (40, 41)
+"""Of the fits whose posterior is reported."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ def conclude(
     bench: Workbench, found: Findings, episodes: Sequence[Episode], fresh: Sequence[Episode]
 ) -> Diagnosis:
     """The verdict, its effects, and the gap before and after."""
-    settings, question = bench.settings, bench.question
+    settings = bench.settings
     gap: tuple[Gap, ...] = ()
     share = math.nan
     if found.final is not found.base:
@@ -48,7 +54,8 @@ def conclude(
         left = settings.adequacy and not found.after.adequate(settings.level)
         if left and not share >= HALF:
             found, gap, share = _without_effects(bench, found, share), (), math.nan
-    belief, first = (posterior(question, fit) for fit in (found.final, found.base))
+    first = _reported(bench, found.base)
+    belief = first if found.final is found.base else _reported(bench, found.final)
     effects = (
         *(NamedEffect("numerics", (), v.note) for v in found.variants if v.name in NUMERICS),
         *named_effects(belief, bench.given),
@@ -85,6 +92,17 @@ def conclude(
         belief=belief,
         belief_before=first,
     )
+
+
+def _reported(bench: Workbench, fit: Fit) -> Belief:
+    """The posterior of a model as it is reported, wider than the one that evidence comes from."""
+    question = bench.question
+    try:
+        wide = fit_model(question, fit.effects, SEEDS, start=(fit,), step=fit.step, power=POWER)
+    except Exception as error:
+        bench.warn(f"intervals are too narrow: {type(error).__name__} in the last fit: {error}")
+        wide = fit
+    return posterior(question, wide)
 
 
 def _without_effects(bench: Workbench, found: Findings, share: float) -> Findings:

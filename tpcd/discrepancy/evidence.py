@@ -116,17 +116,20 @@ def fit_model(
     start: Sequence[Fit] = (),
     step: StepSettings | None = None,
     places: Float[Tensor, "k s"] | None = None,
+    power: float = 1.0,
 ) -> Fit:
     """Fit the base model with these effects; seeds are told apart by their numbers.
 
     Besides the prior, a fit also starts from where those in `start` arrived, and from `places`.
+    With a `power` of the likelihood below 1 the posterior is wider, and what stands for its
+    evidence is none.
     """
     effects = tuple(effects)
     prior = question.scene.with_effects(effects)
     step = question.step if step is None else step
-    target = ContactTarget(prior, question.misfit, step, question.history)
+    target = ContactTarget(prior, question.misfit, step, question.history, power)
     names = tuple(effect.name for effect in effects)
-    model = (question.fingerprint, names, prior.low, prior.high, step)
+    model = (question.fingerprint, names, prior.low, prior.high, step, power)
     begun = tuple(fit.fingerprint for fit in start)
     clouds = []
     for seed in seeds:

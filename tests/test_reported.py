@@ -1,0 +1,64 @@
+"""The posterior that a diagnosis reports: as wide as its power of the likelihood makes it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.history import joined_history
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import make_prior
+from tpcd.discrepancy import conclude
+from tpcd.discrepancy.coverage import coverage_of
+from tpcd.discrepancy.evidence import Question, fit_model, posterior
+from tpcd.discrepancy.naming import Workbench
+from tpcd.discrepancy.settings import DiagnosisSettings
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+SAMPLER = SamplerSettings(particles=400, draws=1500, prior_draws=200, fresh_modes=20, places=60)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Workbench:
+    """A mug of known outline, with the lines that are told in its notes."""
+    outline = builtin_outlines()["mug"]
+    generator = torch.Generator().manual_seed(5)
+    scene = draw_scene("mug", outline.vertices, generator)
+    truth = make_truth(scene, "quasistatic")
+    motion = make_motion("diagnosis", scene, 20, generator)
+    episode = record(truth, scene, motion, 20, generator).measured
+    question = Question(
+        joined_history([episode]),
+        make_prior(PolygonShape(outline)),
+        MisfitField(0.0),
+        StepSettings(),
+        SAMPLER,
+    )
+    settings = DiagnosisSettings(sampler=SAMPLER)
+    return Workbench(question, settings, coverage_of([episode]), 0, lambda line: None)
+
+
+def test_reported_intervals_are_wider_and_hold_the_same_place(bench: Workbench) -> None:
+    fit = fit_model(bench.question, (), (0, 1))
+    own, told = posterior(bench.question, fit), conclude._reported(bench, fit)
+    wider = (told.std() / own.std()).log().mean().exp()
+    assert 1.05 < float(wider) < 1.6  # 1 / sqrt(0.6) = 1.29
+    assert ((told.mean() - own.mean()).abs() < 2 * own.std()).all()
+
+
+def test_a_last_fit_that_fails_leaves_the_narrow_one_and_says_so(
+    bench: Workbench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ValueError("no draw at all")
+
+    fit = fit_model(bench.question, (), (0,))
+    monkeypatch.setattr(conclude, "fit_model", broken)
+    found = conclude._reported(bench, fit)
+    torch.testing.assert_close(found.mean(), posterior(bench.question, fit).mean())
+    assert "intervals are too narrow: ValueError in the last fit: no draw at all" in bench.notes

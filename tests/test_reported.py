@@ -49,6 +49,7 @@ def test_reported_intervals_are_wider_and_hold_the_same_place(bench: Workbench) 
     wider = (told.std() / own.std()).log().mean().exp()
     assert 1.05 < float(wider) < 1.6  # 1 / sqrt(0.6) = 1.29
     assert ((told.mean() - own.mean()).abs() < 2 * own.std()).all()
+    assert told.log_evidence == fit.log_evidence
 
 
 def test_a_last_fit_that_fails_leaves_the_narrow_one_and_says_so(

@@ -102,7 +102,11 @@ def _reported(bench: Workbench, fit: Fit) -> Belief:
     except Exception as error:
         bench.warn(f"intervals are too narrow: {type(error).__name__} in the last fit: {error}")
         wide = fit
-    return posterior(question, wide)
+    return replace(
+        posterior(question, wide),
+        log_evidence=fit.log_evidence,
+        log_evidence_std=fit.cloud.log_evidence_std,
+    )
 
 
 def _without_effects(bench: Workbench, found: Findings, share: float) -> Findings:

@@ -125,9 +125,9 @@ def _verdict(
     told = " and ".join(effect.sentence for effect in effects)
     after, level = found.after, bench.settings.level
     if bench.settings.adequacy and not after.adequate(level):
-        cell = after.cells[0]
         where = f"{after.unexplained:.0%} of the transitions are not explained"
-        if after.cells_p <= level:
+        if after.cells and after.cells_p <= level:
+            cell = after.cells[0]
             where += f"; most of it in {cell.channel} ({cell.covariate}) while {cell.mode}"
         besides = f"; besides, {told}" if told else ""
         return "unknown_remains", f"something else is missing: {where}{besides}"

@@ -120,11 +120,14 @@ def find_confusions(bench: Workbench, base: Fit) -> None:
         bench.tell(f"preflight: these data hardly tell {pairs}")
 
 
-def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: bool) -> Round:
-    """Try one more effect of the pool; `adequate` says whether the model so far explains all."""
+def name_one(
+    bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: bool, excited: bool = True
+) -> Round:
+    """Try one more effect of the pool, of those that the data excite or of the others; `adequate`
+    says whether the model so far explains all."""
     settings, question = bench.settings, bench.question
     number = len(current.effects) - bench.given + 1
-    glances = _glances(bench, current, pool, number, adequate)
+    glances = _glances(bench, current, pool, number, adequate, excited)
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
     worth = current.log_evidence + WORTH_FITTING[adequate]
@@ -208,18 +211,28 @@ def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
 
 
 def _glances(
-    bench: Workbench, current: Fit, pool: Sequence[Effect], number: int, adequate: bool
+    bench: Workbench,
+    current: Fit,
+    pool: Sequence[Effect],
+    number: int,
+    adequate: bool,
+    excited: bool,
 ) -> list[Glance]:
-    """A quick look at every effect that the data excite, the best first."""
+    """A quick look at every effect that the data excite, or at the others, the best first."""
     candidates = [effect for effect in pool if effect.name not in current.names]
-    excited = bench.excited(candidates)
-    for effect in candidates:
-        if effect not in excited:
+    chosen = bench.excited(candidates)
+    others = [effect for effect in candidates if effect not in chosen]
+    if excited:
+        for effect in others:
             lacks = ", ".join(bench.coverage.missing(effect.needs))
             outcome = f"not excited: {lacks}"
             bench.candidates.append(Candidate(effect.name, number, math.nan, (), outcome))
+    else:
+        chosen = others
+        again = {(effect.name, number) for effect in others}
+        bench.candidates[:] = [c for c in bench.candidates if (c.name, c.round) not in again]
     fresh = FRESH[adequate] if bench.settings.from_prior else 0
-    glances = _each(bench, excited, number, lambda e: glance(bench.question, current, e, fresh))
+    glances = _each(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
     return sorted(glances, key=lambda g: -g.log_evidence)
 
 

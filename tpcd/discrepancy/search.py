@@ -119,7 +119,8 @@ def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
 
 
 def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
-    """All rounds: the catalogue, then formulas where it does not suffice."""
+    """All rounds: the catalogue; where it does not suffice, what the data hardly excite, since an
+    effect may be what keeps them from it (a rough wall, on which nothing slips); then formulas."""
     settings = bench.settings
     base = current = fit_well(bench, effects)
     before = bench.adequacy(base)
@@ -127,11 +128,13 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     _tell_adequacy(bench, "the model as it is", before)
     variants: list[Variant] = []
     close = ()
-    for pool in (settings.catalogue, FORMULAS):
+    stages = ((settings.catalogue, True), (settings.catalogue, False), (FORMULAS, True))
+    for stage, (pool, excited) in enumerate(stages):
         while len(current.effects) - bench.given < settings.most_effects:
             first = len(current.effects) == bench.given
-            found = name_one(bench, current, pool, bench.adequacy(current).adequate(0.05))
-            untried = pool is settings.catalogue and not variants
+            adequate = bench.adequacy(current).adequate(0.05)
+            found = name_one(bench, current, pool, adequate, excited)
+            untried = stage == 0 and not variants
             if untried and not _explains(bench, found.base):
                 changed = _changed_base(bench, found)
                 if changed is not None:

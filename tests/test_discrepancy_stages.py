@@ -1,0 +1,99 @@
+"""Which effects are tried at which stage of a diagnosis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.history import joined_history
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import make_prior
+from tpcd.discrepancy import naming, search
+from tpcd.discrepancy.adequacy import Adequacy
+from tpcd.discrepancy.coverage import coverage_of
+from tpcd.discrepancy.evidence import Fit, Question, fit_model
+from tpcd.discrepancy.formula import FORMULAS
+from tpcd.discrepancy.naming import Round, Workbench
+from tpcd.discrepancy.screening import Glance
+from tpcd.discrepancy.search import DiagnosisSettings, diagnose
+from tpcd.effects import Effect, find_effect
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+CATALOGUE = tuple(find_effect(n) for n in ("floor_compliance", "wall_friction", "wall_tilt"))
+SETTINGS = DiagnosisSettings(
+    sampler=SamplerSettings(
+        particles=60, draws=200, prior_draws=100, fresh_modes=10, modes=4, rounds=1, places=20
+    ),
+    catalogue=CATALOGUE,
+)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    """Steps that never slide along the wall."""
+    generator = torch.Generator().manual_seed(5)
+    outline = builtin_outlines()["mug"].vertices
+    scene = replace(draw_scene("mug", outline, generator), wall_position=2.0)
+    truth = make_truth(scene, "quasistatic")
+    motion = make_motion("rich", scene, 16, generator)
+    found = record(truth, scene, motion, 16, generator).measured
+    assert coverage_of([found]).missing(find_effect("wall_friction").needs)
+    return found
+
+
+def test_effects_that_the_data_hardly_excite_are_tried_before_formulas(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[tuple[str, ...], bool]] = []
+
+    def nothing(bench: Workbench, current: Fit, pool, adequate: bool, excited: bool) -> Round:
+        asked.append((tuple(effect.name for effect in pool), excited))
+        return Round(current)
+
+    left = Adequacy(0.3, 1e-9, 0.5, ())
+    monkeypatch.setattr(search, "name_one", nothing)
+    monkeypatch.setattr(search, "better_base", lambda *_: None)
+    monkeypatch.setattr(search, "find_confusions", lambda *_: None)
+    monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: left)
+    diagnose([episode], PolygonShape(builtin_outlines()["mug"]), SETTINGS)
+    names = tuple(effect.name for effect in CATALOGUE)
+    formulas = tuple(effect.name for effect in FORMULAS)
+    assert asked == [(names, True), (names, False), (formulas, True)]
+
+
+@pytest.mark.parametrize("excited", [True, False])
+def test_a_look_is_at_effects_that_the_data_excite_or_at_the_others(
+    episode, excited: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shape = PolygonShape(builtin_outlines()["mug"])
+    question = Question(
+        joined_history([episode]), make_prior(shape), MisfitField(0.0), StepSettings(),
+        SETTINGS.sampler,
+    )  # fmt: skip
+    bench = Workbench(question, SETTINGS, coverage_of([episode]), 0, lambda line: None)
+    fit = fit_model(question, (), (0,))
+    looked: list[str] = []
+
+    def glance(question: Question, current: Fit, effect: Effect, fresh: int) -> Glance:
+        looked.append(effect.name)
+        return Glance(effect, -1.0, (1.0,), torch.zeros(1))
+
+    monkeypatch.setattr(naming, "glance", glance)
+    naming._glances(bench, fit, CATALOGUE, 1, False, True)
+    others = {c.name for c in bench.candidates}
+    assert "wall_friction" in others and "floor_compliance" not in others
+    assert all(c.outcome.startswith("not excited") and math.isnan(c.gain) for c in bench.candidates)
+    assert set(looked) == {effect.name for effect in CATALOGUE} - others
+    if not excited:
+        looked.clear()
+        naming._glances(bench, fit, CATALOGUE, 1, False, False)
+        assert set(looked) == others
+        assert bench.candidates == []  # what is tried says how it fared

@@ -21,7 +21,8 @@ from tpcd.simulator import StepSettings
 
 
 def found_effects(belief: Belief) -> Found:
-    """Posterior mean and standard deviation of the parameters of the belief's own effects."""
+    """Posterior mean and standard deviation [SI units] of the parameters of the belief's effects,
+    one by one: what is known of several together is not told."""
     entries = belief.prior.names[belief.prior.scene_dimension :]
     mean, std = belief.mean().tolist(), belief.std().tolist()
     found: dict[str, dict[str, tuple[float, float]]] = {}
@@ -34,10 +35,10 @@ def found_effects(belief: Belief) -> Found:
 def with_model(belief: Belief, model: Model, generator: torch.Generator) -> Belief:
     """The belief with the effects of a model besides its own, drawn anew for each particle.
 
-    Parameters are drawn from the normal distribution that the model file says was found, within
-    their prior; from the prior where it says nothing. Settings of the step that are not the
-    default replace those of the belief. Raises ValueError for an effect that the belief has
-    already.
+    Parameters are drawn independently, from the normal distribution that the model file says was
+    found, within their prior; from the prior where it says nothing. Settings of the step that are
+    not the default replace those of the belief. Raises ValueError for an effect that the belief
+    has already.
     """
     own = [effect.name for effect in belief.prior.effects]
     twice = [effect.name for effect in model.effects if effect.name in own]
@@ -62,7 +63,7 @@ def _draw(
     count: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "count p"]:
-    """Draws of an effect's parameters, one column for each."""
+    """Draws of an effect's p parameters [SI units], one column for each."""
     columns = []
     for parameter in effect.parameters:
         place = torch.rand(count, generator=generator, dtype=torch.float64)

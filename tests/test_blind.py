@@ -159,7 +159,7 @@ def key(suite: str, *names: str, run: int = 0) -> dict:
     label = "pair" if suite == "pairs" else names[0] if names else "clean"
     return {
         "suite": suite, "label": label, "run": run, "hidden": hidden,
-        "theta": {"friction": 0.5, "scale": 1.0},
+        "theta": {"friction": 0.5, "scale": 1.0, "object_width": 0.1},
     }  # fmt: skip
 
 
@@ -203,14 +203,15 @@ def test_clean_data_ask_for_nothing_missing_and_numerics_is_no_physics() -> None
 def test_sizes_and_theta_are_scored_against_the_key() -> None:
     parameters = [interval("weight", 1.1, 0.02), interval("lever", 0.031, 0.01)]
     theta = [interval("friction", 0.6, 0.05), interval("scale", 1.2, 0.05),
-             interval("latent_0", 9.0, 0.1)]  # fmt: skip
+             interval("object_width", 0.112, 2e-3), interval("latent_0", 9.0, 0.1)]  # fmt: skip
     one = score_line(key("medium", "payload"), found("named", "payload", payload=parameters,
                                                      theta=theta))  # fmt: skip
     assert one.size_errors == pytest.approx((0.1,))
     assert one.size_inside == (False, True)
-    assert one.theta_scores == pytest.approx({"friction": 2.0, "scale": 4.0})
+    assert one.theta_scores == pytest.approx({"friction": 2.0, "scale": 4.0, "object_width": 6.0})
     (line,) = [row for row in mark_table([one]) if row["item"].startswith("theta")]
-    assert line["found"] == "50.0%" and "scale 0%, the others 100%" in line["note"]
+    assert line["found"] == "50.0%"
+    assert "worst object_width 0%; not counted: scale 0%" in line["note"]
     missed = score_line(key("medium", "payload"), found("named", "force_bias", theta=theta))
     assert (missed.size_errors, missed.theta_scores) == ((), {})
 

@@ -102,6 +102,10 @@ def test_an_object_larger_than_any_of_the_prior_is_no_effect(shape: PolygonShape
     assert "unlike those of the shape prior" in found.shape
     scale = next(e for e in found.theta_after if e.name == "scale")
     assert abs(scale.value - 2.2 * scene.theta["scale"]) < 0.1
+    extents = scene.vertices_ee.amax(0) - scene.vertices_ee.amin(0)
+    for name, true in zip(("object_width", "object_height"), extents.tolist(), strict=True):
+        size = next(e for e in found.theta_after if e.name == name)
+        assert abs(size.value - true) < 3 * size.sd < 0.01
     assert found.unexplained_before > 0.2 > found.unexplained_after
 
 

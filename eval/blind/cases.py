@@ -20,6 +20,7 @@ from eval.blind.suites import CLEAN, EFFECTS, MEDIUM, OUTSIDE, PAIR, PLACES, RAN
 from eval.unseen import UNSEEN
 from tpcd.data import Episode
 from tpcd.data.checks import FREE_WRENCH, NOISE_FACTOR
+from tpcd.discrepancy.report_parts import SIZES
 from tpcd.effects import find_effect
 from tpcd.random import stream
 from tpcd.shape.builtin import builtin_outlines
@@ -50,11 +51,17 @@ class World:
     hidden: Hidden
     """Effects with their parameters in SI units."""
 
+    @property
+    def size(self) -> dict[str, float]:
+        """Extents of the held outline along the end effector's axes [m]."""
+        points = self.scene.vertices_ee
+        return dict(zip(SIZES, (points.amax(0) - points.amin(0)).tolist(), strict=True))
+
     def key(self) -> dict[str, Any]:
         """In plain values."""
         return {
             "object": self.scene.outline_name,
-            "theta": self.scene.theta,
+            "theta": self.scene.theta | self.size,
             "start_pose": self.scene.start_pose.tolist(),
             "hidden": self.hidden,
         }

@@ -20,6 +20,8 @@ CLOSED = 0.7
 """A formula should close this share of the excess."""
 THETA = 3.0
 """Posterior deviations within which theta should be."""
+SCALE = "scale"
+"""The entry of theta that has no true value for an outline that the prior does not hold."""
 
 
 @dataclass(frozen=True)
@@ -136,19 +138,21 @@ def _pooled(values: Callable[[Score], Sequence[bool]]) -> Callable[[Sequence[Sco
 
 
 def _theta_within(scores: Sequence[Score]) -> Finding:
-    """Entries of theta near the truth, with the worst of them by name. The scale multiplies an
-    outline that has a size of its own, which for an object that the prior does not hold is another
-    one than the true outline's."""
+    """Entries of theta near the truth, the outline's extents in the place of the scale.
+
+    The scale multiplies an outline of the prior that has a size of its own, so for an object that
+    the prior does not hold it has no true value; the note has it and the worst of the others."""
     chosen = [s for s in scores if s.suite == "medium" and s.theta_scores]
     names = dict.fromkeys(name for s in chosen for name in s.theta_scores)
     near = {name: [s.theta_scores[name] <= THETA for s in chosen] for name in names}
+    scale = near.pop(SCALE, [])
     pooled = [value for values in near.values() for value in values]
-    worst = min(near, key=lambda name: sum(near[name]), default="")
-    rest = [value for name, values in near.items() if name != worst for value in values]
     note = f"of {len(pooled)} numbers"
-    if rest:
-        share = sum(near[worst]) / len(near[worst])
-        note += f"; {worst} {share:.0%}, the others {sum(rest) / len(rest):.0%}"
+    if near:
+        worst = min(near, key=lambda name: sum(near[name]))
+        note += f"; worst {worst} {sum(near[worst]) / len(near[worst]):.0%}"
+    if scale:
+        note += f"; not counted: scale {sum(scale) / len(scale):.0%}"
     finding = _of(sum(pooled), len(pooled), note)
     return Finding(finding.value, finding.low, finding.high, len(chosen), note)
 

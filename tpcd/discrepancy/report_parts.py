@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tpcd.belief.belief import Belief
+import torch
+
+from tpcd.belief.belief import Belief, weighted_quantile
+from tpcd.contact import place_points
 from tpcd.discrepancy.coverage import Coverage
 from tpcd.discrepancy.diagnosis import Estimate, Limit, NamedEffect
 from tpcd.discrepancy.screening import Glance
 from tpcd.effects.protocol import Effect, EffectParameter
+
+SIZES = ("object_width", "object_height")
+"""Names of the outline's extents."""
 
 
 def named_effects(belief: Belief, given: int) -> tuple[NamedEffect, ...]:
@@ -29,8 +35,28 @@ def named_effects(belief: Belief, given: int) -> tuple[NamedEffect, ...]:
 
 
 def theta_estimates(belief: Belief) -> tuple[Estimate, ...]:
-    """Mean, sd and 90 % interval of the scene's entries of theta."""
-    return estimates(belief)[: belief.prior.scene_dimension]
+    """Mean, sd and 90 % interval of the scene's entries of theta, and of the outline's size."""
+    return (*estimates(belief)[: belief.prior.scene_dimension], *size_estimates(belief))
+
+
+def size_estimates(belief: Belief) -> tuple[Estimate, ...]:
+    """Width and height of the held outline along the end effector's axes [m].
+
+    Unlike the scale, which multiplies an outline of the prior with a size of its own, they can
+    be held against a ruler. Each of two opposite sides is off by the misfit of its own.
+    """
+    theta, weights = belief.parameters, belief.weights
+    points = belief.prior.shape.boundary_points(theta.latent)
+    points = place_points(points, theta.scale, theta.mount).double()
+    sizes = points.amax(-2) - points.amin(-2)
+    generator = torch.Generator().manual_seed(0)
+    off = torch.randn(2, *sizes.shape, generator=generator, dtype=torch.float64).sum(0)
+    sizes = sizes + belief.misfit_sd[:, None] * off
+    mean = weights @ sizes
+    std = (weights @ (sizes - mean) ** 2).sqrt()
+    low, high = (weighted_quantile(sizes, weights, level) for level in (0.05, 0.95))
+    columns = zip(SIZES, *(c.tolist() for c in (mean, std, low, high)), strict=True)
+    return tuple(Estimate(*column, "m") for column in columns)
 
 
 def estimates(belief: Belief) -> tuple[Estimate, ...]:

@@ -75,8 +75,8 @@ def test_episodes_together_say_more() -> None:
     alone = estimate_noise([episode_of(0)])
     assert together is not None and alone is not None
     assert min(together.freedom) > 3 * min(alone.freedom)
-    assert np.allclose(np.array(together.std) / STD, 1.0, atol=0.2)
     error = 1 / np.sqrt(2 * min(together.freedom))
+    assert np.allclose(np.array(together.std) / STD / (1 + error), 1.0, atol=2 * error)
     assert f"good to about {error:.0%}" in together.sentence()
 
 

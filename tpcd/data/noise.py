@@ -122,13 +122,13 @@ def check_noise(episode: Episode) -> list[str]:
         near = int((away[:, k] < NEAR * stated[k]).sum())
         # A normal number is never likelier to come so near to anything, rounded or not.
         share = math.erf((NEAR + step / 2) / math.sqrt(2.0))
-        by_share = binom.sf(near - 1, len(away), share) < SURE
+        by_share = float(binom.sf(near - 1, len(away), share))
         least = max(_ratio(episode, k, alone=True)[0], step / math.sqrt(12.0))
-        by_scatter = least < TOO_LARGE and chi2.cdf(least**2 * freedom, freedom) < SURE
-        if by_share or by_scatter:
+        by_scatter = float(chi2.cdf(least**2 * freedom, freedom)) if least < TOO_LARGE else 1.0
+        if min(by_share, by_scatter, _fisher(by_share, by_scatter)) < SURE:
             found = (
                 f"{near} of {len(away)} rows lie within a fifth of it of where they would be"
-                if by_share
+                if by_share < by_scatter
                 else f"readings scatter by {ratio * stated[k]:.2g}"
             )
             raise EpisodeError(
@@ -149,6 +149,12 @@ def check_noise(episode: Episode) -> list[str]:
             )
         warnings.append(f"{told}: it is too small, or the arm creeps or lags")
     return warnings
+
+
+def _fisher(first: float, second: float) -> float:
+    """Probability of two independent ones together (Fisher 1932)."""
+    product = max(first * second, 1e-300)
+    return product * (1.0 - math.log(product))
 
 
 _PAUSES, _PARITY = "rows of one command differ", "w - K (x - u) scatters"

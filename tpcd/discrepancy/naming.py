@@ -23,6 +23,7 @@ from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
+    CLEAR,
     CLOSER,
     CLOSER_SEEDS,
     FRESH,
@@ -158,7 +159,7 @@ def name_one(
             near = [fitted_again(bench, fit, 11, (current, fit)) for fit in near[:2]]
             near.sort(key=lambda fit: -fit.log_evidence)
     lead = near[0].log_evidence - current.log_evidence if near else -math.inf
-    if UNDECIDED[adequate] < lead < SURE:
+    if UNDECIDED[adequate] < lead < CLEAR:
         current, near = _looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)

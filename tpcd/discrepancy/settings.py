@@ -29,8 +29,13 @@ CLOSER_SEEDS = (30, 31, 32)
 UNDECIDED = {True: 2.0, False: -10.0}
 """Gain from which it does not lose clearly: where the model explains the data, and where not."""
 AMBIGUOUS = 3.0
-SURE = 25.0
-"""Gain from which blocks held out have no veto: their fits to fewer data are less sure than it."""
+CLEAR = 25.0
+"""Gain from which a candidate wins clearly, and is not looked at more closely."""
+SURE = 10.0
+"""Gain from which blocks held out have no veto. Where an effect shows in one stretch of the data
+alone, the model fitted without that stretch does not know it, and the veto is blind: of judged
+candidates that gained 10 to 25, it had stopped one false name and four true ones. Clean data
+never gained more than 8.3 in 224 diagnoses."""
 VETO_LEVEL = 0.2
 """Of the bound of the held-out gain. What shows in one stretch of the data alone, such as a push
 that static friction holds, is missed by the bootstrap in a third of its draws, so that a bound

@@ -1,9 +1,10 @@
 """A motion that excites every effect a diagnosis may look for, the informative part first.
 
-By about 15 commands it has pressed and slid on floor and wall; by 30 it has moved, turned
-and paused in free space, and pressed one spot of the floor at three loads; by 60 it has done
-the same on the wall, slid both ways on both at two loads, and touched the floor at three
-places. From then on it goes on with random visits of the same kinds.
+By about 15 commands it has pressed and slid on floor and wall at two loads, and moved, turned
+and paused in free space; by 30 it has pressed one spot of the floor at three loads, pushed
+along it without and with slip, and turned under load both ways; by 60 it has done the same on
+the wall, slid both ways on both at two loads, and touched the floor at three places. From then
+on it goes on with random visits of the same kinds.
 """
 
 from __future__ import annotations
@@ -53,11 +54,12 @@ def diagnosis_motion(generator: torch.Generator) -> ScriptedMotion:
 def _script(history: History, generator: torch.Generator) -> Script:
     side = 1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0
     history = yield from _descend(history)
-    history = yield from _follow(history, [press(MEDIUM), slide(LEFT, MEDIUM), tilt(side)])
+    first = [press(HARD), slide(LEFT, MEDIUM), nudge(RIGHT, HARD, NUDGES[0])]
+    history = yield from _follow(history, first)
     history = yield from _search_wall(history)
     for visit in (
-        [corner(MEDIUM, MEDIUM), climb(MEDIUM), wall_slide(DOWN, MEDIUM)],
-        _free_visit(PLACES[1], side),
+        [corner(HARD, HARD, side), climb(HARD), wall_slide(DOWN, LIGHT), wall_slide(UP, HARD)],
+        [above(PLACES[1]), pause, free(PLACES[1], -0.02, 0.02, side * TILT)],
         [above(PLACES[1]), *_press_at_loads(press), *_pushes(HARD)],
         [tilt(side, LIGHT), tilt(side, HARD), tilt(-side, HARD), tilt(-side, LIGHT)],
         [slide(LEFT, HARD), slide(RIGHT, HARD), pause, peel],
@@ -102,12 +104,9 @@ def _random_visit(generator: torch.Generator) -> list[Move]:
 
 
 def _free_visit(place: float, side: float) -> list[Move]:
-    """Lift, then move and turn in free space one way and the other on every axis, and wait."""
-
-    def at(dx: float, dz: float, angle: float) -> Move:
-        return lambda felt: (felt.wall_x - place + dx, felt.floor_z + CLEARANCE + dz, angle)
-
-    return [above(place), at(0.02 * side, 0.02, TILT), at(-0.015 * side, 0.0, -TILT), pause]
+    """Lift, wait, then move and turn in free space one way and the other on every axis."""
+    there, back = free(place, 0.02 * side, 0.02, TILT), free(place, -0.015 * side, 0.0, -TILT)
+    return [above(place), pause, there, back]
 
 
 def _pushes(load: float) -> list[Move]:
@@ -178,6 +177,11 @@ def wall_peel(felt: Feel) -> Command:
 def above(place: float) -> Move:
     """Off to free space over a place on the floor, left of the wall by so much [m]."""
     return lambda felt: (felt.wall_x - place, felt.floor_z + CLEARANCE, 0.0)
+
+
+def free(place: float, dx: float, dz: float, angle: float) -> Move:
+    """To free space, off such a place by so much [m], and turned [rad]."""
+    return lambda felt: (felt.wall_x - place + dx, felt.floor_z + CLEARANCE + dz, angle)
 
 
 def facing_wall(felt: Feel) -> Command:

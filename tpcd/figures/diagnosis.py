@@ -129,6 +129,7 @@ def worst_stretch(
             )
         panel.set_ylabel(f"{names[k]} [{unit}]")
     axes[-1].set_xlabel("row")
+    axes[-1].locator_params(axis="x", integer=True)
     entries = {
         "measured, ± 2 sd of the noise": Line2D([], [], color=TRUTH),
         "predicted before": Line2D([], [], color=BEFORE, marker="o", linewidth=0),

@@ -17,7 +17,6 @@ from tpcd.truth.contact_feel import Command, Feel, as_command, feel
 from tpcd.truth.motions import (
     LARGEST_DRAG,
     SEARCH_STEP_DOWN,
-    SEARCH_STEP_RIGHT,
     History,
     Script,
     ScriptedMotion,
@@ -31,6 +30,8 @@ PLACES = (0.085, 0.05, 0.018)
 """Where the floor is touched: left of where the hand meets the wall [m]."""
 SLIDE, WALL_SLIDE = 0.025, 0.018
 """Distances of slides on the floor and on the wall [m]."""
+STRIDE = 0.055
+"""Of the search for the wall [m], which is hit with so much at most: 5.5 N at 100 N/m."""
 CLEARANCE = 0.035
 """Height of free moves, and of the hand on the wall, over the floor [m]."""
 HELD, NUDGES = 0.85, (1.1, 1.25)
@@ -54,7 +55,7 @@ def diagnosis_motion(generator: torch.Generator) -> ScriptedMotion:
 def _script(history: History, generator: torch.Generator) -> Script:
     side = 1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0
     history = yield from _descend(history)
-    first = [press(HARD), slide(LEFT, MEDIUM), nudge(RIGHT, HARD, NUDGES[0])]
+    first = [press(HARD), slide(LEFT, MEDIUM), lean(RIGHT, HARD)]
     history = yield from _follow(history, first)
     history = yield from _search_wall(history)
     for visit in (
@@ -268,6 +269,6 @@ def _search_wall(history: History) -> Generator[Command, History, History]:
     felt = feel(history)
     while not felt.at_wall:
         drag = min(felt.floor_friction * LIGHT, LARGEST_DRAG) / felt.stiffness[0]
-        history = yield (felt.x + SEARCH_STEP_RIGHT + drag, _down(felt, LIGHT), 0.0)
+        history = yield (felt.x + STRIDE + drag, _down(felt, LIGHT), 0.0)
         felt = feel(history)
     return history

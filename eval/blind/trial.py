@@ -20,7 +20,7 @@ from tpcd.files import to_plain
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.protocol import Shape
 
-LEFT_OUT = ("cells_before", "cells_after", "detection_limits")
+LEFT_OUT = ("cells_before", "cells_after")
 """Long parts of a diagnosis that are not scored."""
 
 

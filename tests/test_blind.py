@@ -193,19 +193,19 @@ def test_the_truth_among_the_alternatives_is_within_and_not_wrong() -> None:
     assert (wrong.is_within, wrong.is_wrong) == (False, True)
 
 
-def test_what_is_missed_is_beyond_the_limits_where_the_report_says_so() -> None:
+def test_what_is_missed_is_below_the_limit_where_the_report_says_so() -> None:
     truth = key("small", "payload")  # 1 N at 30 mm, of which the lever is a place
 
     def missed(*limits: tuple[str, float | None], verdict: str = "nothing_missing") -> bool:
         told = [{"name": "payload", "parameter": name, "size": size} for name, size in limits]
-        return score_line(truth, found(verdict, closed=None, limits=told)).is_beyond
+        return score_line(truth, found(verdict, closed=None, limits=told)).is_below_limit
 
     assert missed(("weight", 1.1)) and missed(("weight", None))
     assert missed(("weight", 1.1), verdict="not_enough_information")
     assert not missed(("weight", 0.9)) and not missed(("lever", 1.0)) and not missed()
     named = found("named", "floor_tilt", limits=[dict(name="payload", parameter="weight", size=2)])
-    assert not score_line(truth, named).is_beyond
-    assert not score_line(key("clean"), found("nothing_missing", closed=None)).is_beyond
+    assert not score_line(truth, named).is_below_limit
+    assert not score_line(key("clean"), found("nothing_missing", closed=None)).is_below_limit
 
 
 def test_clean_data_ask_for_nothing_missing_and_numerics_is_no_physics() -> None:

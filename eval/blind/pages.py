@@ -118,7 +118,7 @@ def _rates(scores: Sequence[Score], is_clean: bool) -> Row:
     row["wrong name"] = share(is_falsely_named if is_clean else lambda s: s.is_wrong)
     row["unknown"] = share(lambda s: s.verdict == "unknown_remains")
     row["nothing"] = share(lambda s: s.verdict == "nothing_missing")
-    row["beyond limits"] = share(lambda s: s.is_beyond)
+    row["below limit"] = share(lambda s: s.is_below_limit)
     row["too little"] = share(lambda s: s.verdict == "not_enough_information")
     row["failed"] = share(lambda s: s.verdict == "failed")
     row["gap closed"] = closed if math.isfinite(closed) else None

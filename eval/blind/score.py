@@ -49,9 +49,9 @@ class Score:
     """Exact, or the truth is among the alternatives reported."""
     is_wrong: bool
     """Something else is named and the truth is not even among the alternatives."""
-    is_beyond: bool
+    is_below_limit: bool
     """Nothing is named, and the limits that are reported say that so small an effect could not be
-    seen in these data."""
+    seen in these data (below the detection limit)."""
     closed: float
     """Share of the excess over the noise floor that is gone on fresh data: 0 where an effect is
     hidden and none was named, NaN where there is no excess."""
@@ -102,7 +102,7 @@ def score_line(key: Mapping[str, Any], line: Mapping[str, Any]) -> Score:
         is_exact=is_exact,
         is_within=is_within,
         is_wrong=not is_within and not set(names) <= set(truth),
-        is_beyond=bool(truth) and not names and _is_beyond(key["hidden"], found),
+        is_below_limit=bool(truth) and not names and _is_below_limit(key["hidden"], found),
         closed=0.0 if truth and not names else _number(found["share_closed"]),
         size_errors=tuple(errors),
         size_inside=tuple(inside),
@@ -165,7 +165,7 @@ def _sizes(
     return errors, inside
 
 
-def _is_beyond(hidden: Mapping[str, Mapping[str, float]], found: Mapping[str, Any]) -> bool:
+def _is_below_limit(hidden: Mapping[str, Mapping[str, float]], found: Mapping[str, Any]) -> bool:
     """Whether every parameter that is hidden is smaller than its limit; none is without one."""
     limits = {
         (one["name"], one["parameter"]): math.inf if one["size"] is None else one["size"]

@@ -31,7 +31,8 @@ PLACES = (0.085, 0.05, 0.018)
 SLIDE, WALL_SLIDE = 0.025, 0.018
 """Distances of slides on the floor and on the wall [m]."""
 STRIDE = 0.055
-"""Of the search for the wall [m], which is hit with so much at most: 5.5 N at 100 N/m."""
+"""Of the search for the wall [m], which is hit with about 5.5 N at 100 N/m, and never with more
+than `FORCE_LIMIT`."""
 CLEARANCE = 0.035
 """Height of free moves, and of the hand on the wall, over the floor [m]."""
 HELD, NUDGES = 0.85, (1.1, 1.25)
@@ -177,11 +178,11 @@ def wall_peel(felt: Feel) -> Command:
 
 def above(place: float) -> Move:
     """Off to free space over a place on the floor, left of the wall by so much [m]."""
-    return lambda felt: (felt.wall_x - place, felt.floor_z + CLEARANCE, 0.0)
+    return free(place, 0.0, 0.0, 0.0)
 
 
 def free(place: float, dx: float, dz: float, angle: float) -> Move:
-    """To free space, off such a place by so much [m], and turned [rad]."""
+    """To free space, dx and dz [m] from where `above` goes, turned by an angle [rad]."""
     return lambda felt: (felt.wall_x - place + dx, felt.floor_z + CLEARANCE + dz, angle)
 
 

@@ -9,9 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from tpcd.robot.admittance import AdmittanceSettings, at_rest
 from tpcd.robot.arm_settings import ArmSettings
-from tpcd.robot.emulator import EmulatorSettings
+from tpcd.robot.emulator import EmulatorSettings, emulated_frame, emulated_scene
+from tpcd.robot.emulator.controller import SERVO_L, Controller
 from tpcd.robot.emulator.process import running_emulator
+from tpcd.robot.link import Link, Sample
+from tpcd.robot.raw import RawRecord
+from tpcd.robot.servo import Servo
 from tpcd.robot.ur import UniversalRobot
 
 _COUNT = itertools.count(1)
@@ -53,3 +60,40 @@ def arm_with(folder: Path, arm: dict[str, Any] | None = None, **emulator: Any) -
             yield robot
         finally:
             robot.close()
+
+
+class Wired(Link):
+    """A controller in this process, as a link sees it: emulated time, no network, no client."""
+
+    def __init__(self, controller: Controller, rate: float) -> None:
+        self.controller, self.rate, self.alive = controller, rate, True
+        controller.running = True
+
+    def next_sample(self) -> Sample:
+        """The reading after this one."""
+        for _ in range(round(500 / self.rate)):
+            self.controller.advance()
+        told = self.controller.outputs()
+        tcp, wrench, target = (
+            np.array(told[name])
+            for name in ("actual_TCP_pose", "actual_TCP_force", "target_TCP_pose")
+        )
+        return Sample(told["timestamp"], tcp, wrench, target, 0.0)
+
+    def servo(self, target: np.ndarray) -> None:
+        """A target for the controller."""
+        values = {f"input_double_register_{index}": v for index, v in enumerate(target.tolist())}
+        self.controller.write({**values, "input_int_register_0": SERVO_L})
+
+
+def wired_servo(law: AdmittanceSettings | None = None, **changed: Any) -> tuple[Servo, Controller]:
+    """A servo that stands at the start of an emulated scene, and the controller behind it."""
+    settings = emulator_settings(**changed)
+    controller = Controller(settings)
+    stated = ArmSettings("wired", surface_mm_per_10n=settings.surface_mm_per_10n)
+    frame = emulated_frame(settings)
+    servo = Servo(stated, Wired(controller, stated.rate), frame, RawRecord())
+    servo._law = law or servo._law
+    servo.state = at_rest(emulated_scene(settings).start_pose.numpy(), np.zeros(3))
+    servo.noise = settings.force_noise * np.array([1.0, 1.0, 0.05])
+    return servo, controller

@@ -15,6 +15,12 @@ delay). Damping of 0.04 s times the stiffness keeps the delays of servo, filter 
 up, so twice the stiffness of a surface counts. In the air nothing is stiff and the same damping
 would only cost time: there the arm moves with a lighter one, slow enough that the first touch,
 which takes one delay to be felt, stays within a stated force.
+
+Along a slide nothing is stiff either: friction has its limit, and the wrench does not change. So
+where it has not changed over the last `WAY`, the arm goes on in that direction, and only in that,
+as it does in the air, and with the mean wrench of the way in the place of the last reading. What
+lies ahead is felt like any first touch. Noise is not felt: light damping would turn it into steps,
+and friction lets only those forward pass, so that the arm would come to rest too far.
 """
 
 from __future__ import annotations
@@ -33,6 +39,14 @@ REACTION_TIME = 0.05
 LEVER = 0.2
 """Damping of the angle is that of a surface point so far from the end effector [m]. Larger than a
 hand-held object, since flat faces are stiffer against turning than single points."""
+WAY = 0.0015
+"""A way on which the wrench has not changed is soft after so much of it [m]."""
+BEGINNING = 0.3
+"""Of a way, in which its direction is not taken [s]: what was pressed is still coming to rest."""
+SLIGHT = (0.3, 0.3, 0.03)
+"""Change of the slowly filtered wrench that ends a soft way [N, N, N·m]."""
+SLOW_TIME = 0.05
+"""Time constant of that filter [s]; faster changes end it where they exceed `touch`."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +104,18 @@ def settings_for_surface(
 
 
 @dataclass(frozen=True)
+class Mark:
+    """The way on which the wrench has not changed."""
+
+    reference: Float[np.ndarray, " 3"]
+    """A place on it, from which its direction is taken [m, m, rad]."""
+    wrench: Float[np.ndarray, " 3"]
+    """Mean since it last changed [N, N, N·m]."""
+    age: float
+    """Time since then [s]."""
+
+
+@dataclass(frozen=True)
 class AdmittanceState:
     """Where the law stands between two readings."""
 
@@ -99,6 +125,12 @@ class AdmittanceState:
     """Of the reference [m/s, m/s, rad/s]."""
     wrench: Float[np.ndarray, " 3"]
     """Filtered [N, N, N·m]."""
+    slow: Float[np.ndarray, " 3"]
+    """Filtered more slowly [N, N, N·m]."""
+    mark: Mark
+    """The way on which it has not changed."""
+    soft: Float[np.ndarray, " 3"] | None = None
+    """Direction of that way, of length 1 where damping is the metric; None: it is too short."""
     touched_at: Float[np.ndarray, " 3"] | None = None
     """The last reference at which a contact was felt, while it counts."""
 
@@ -110,7 +142,13 @@ class AdmittanceState:
 
 def at_rest(pose: Float[np.ndarray, " 3"], wrench: Float[np.ndarray, " 3"]) -> AdmittanceState:
     """The state of an arm that stands at a pose [m, m, rad] with a wrench [N, N, N·m]."""
-    return AdmittanceState(pose.astype(float), np.zeros(3), wrench.astype(float))
+    pose, wrench = pose.astype(float), wrench.astype(float)
+    return AdmittanceState(pose, np.zeros(3), wrench, wrench, Mark(pose, wrench, SLOW_TIME))
+
+
+def for_new_command(state: AdmittanceState) -> AdmittanceState:
+    """The same state with a way that begins here: what was soft may not be so on the next."""
+    return replace(state, mark=Mark(state.reference, state.slow, SLOW_TIME), soft=None)
 
 
 def residual(
@@ -120,6 +158,14 @@ def residual(
     offset = command - state.reference
     offset[2] = np.remainder(offset[2] + np.pi, 2 * np.pi) - np.pi
     return np.array(settings.stiffness) * offset + state.wrench
+
+
+def travel_time(
+    settings: AdmittanceSettings, state: AdmittanceState, command: Float[np.ndarray, " 3"]
+) -> float:
+    """Time of the way to a command at full speed [s]."""
+    way = (residual(settings, state, command) - state.wrench) / np.array(settings.stiffness)
+    return float((np.abs(way) / np.array(settings.speed_limit)).max())
 
 
 def advance(
@@ -134,8 +180,34 @@ def advance(
     The step is implicit in the spring, so that a late reading makes the arm slow and never
     throws it past the command.
     """
-    share = step / (settings.filter_time + step)
-    filtered = state.wrench + share * (wrench - state.wrench)
+    state = _felt(settings, state, wrench, step)
+    spring = step * np.array(settings.stiffness)
+    free, heavy = np.array(settings.free_damping) + spring, np.array(settings.damping) + spring
+    force = residual(settings, state, command)
+    limit = np.array(settings.speed_limit)
+    if state.touched_at is None:
+        velocity = _within(limit, np.zeros(3), force / free)
+    else:
+        velocity = _within(limit, np.zeros(3), force / heavy)
+        if state.soft is not None:
+            # D = H^1/2 (1 - (1 - d) n n') H^1/2, with d the lighter damping along n.
+            root = np.sqrt(heavy)
+            lighter = float(state.soft @ (free / heavy * state.soft))
+            mean = force - state.wrench + state.mark.wrench
+            along = (1 / lighter - 1) * float(state.soft @ (mean / root)) * state.soft / root
+            velocity = _within(limit, velocity, along)
+    return replace(state, reference=state.reference + step * velocity, velocity=velocity)
+
+
+def _felt(
+    settings: AdmittanceSettings,
+    state: AdmittanceState,
+    wrench: Float[np.ndarray, " 3"],
+    step: float,
+) -> AdmittanceState:
+    """The state with a reading filtered, and what it says of contact and of the way."""
+    filtered = state.wrench + step / (settings.filter_time + step) * (wrench - state.wrench)
+    slow = state.slow + step / (SLOW_TIME + step) * (wrench - state.slow)
     touched_at = state.touched_at
     if bool((np.abs(filtered) > settings.touch).any()):
         touched_at = state.reference
@@ -143,12 +215,29 @@ def advance(
         way = state.reference - touched_at
         if float(np.hypot(way[0], way[1])) > settings.release:
             touched_at = None
-    damping = np.array(settings.free_damping if touched_at is None else settings.damping)
-    force = residual(settings, replace(state, wrench=filtered), command)
-    velocity = force / (damping + step * np.array(settings.stiffness))
-    limit = np.array(settings.speed_limit)
-    velocity = velocity * min(1.0, float((limit / np.maximum(np.abs(velocity), 1e-12)).min()))
-    return AdmittanceState(state.reference + step * velocity, velocity, filtered, touched_at)
+    mark, soft = state.mark, state.soft
+    changed = np.abs(slow - mark.wrench) > SLIGHT
+    if bool((changed | (np.abs(filtered - mark.wrench) > settings.touch)).any()):
+        mark, soft = Mark(state.reference, slow, SLOW_TIME), None
+    else:
+        age = mark.age + step
+        mark = replace(mark, wrench=mark.wrench + step / age * (wrench - mark.wrench), age=age)
+        if age < BEGINNING:
+            mark = replace(mark, reference=state.reference)
+        way = np.sqrt(settings.damping) * (state.reference - mark.reference)
+        length = float(np.linalg.norm(way))
+        if length > WAY * np.sqrt(settings.damping[0]):
+            mark, soft = replace(mark, reference=state.reference), way / length
+    return replace(state, wrench=filtered, slow=slow, mark=mark, soft=soft, touched_at=touched_at)
+
+
+def _within(
+    limit: Float[np.ndarray, " 3"], base: Float[np.ndarray, " 3"], more: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 3"]:
+    """`base` and as much of `more` as keeps each axis within its limit."""
+    room = np.where(more > 0, limit - base, limit + base)
+    share = float((np.maximum(room, 0.0) / np.maximum(np.abs(more), 1e-12)).min())
+    return base + min(1.0, share) * more
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:

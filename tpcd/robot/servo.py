@@ -12,7 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.errors import RobotError
-from tpcd.robot.admittance import AdmittanceState, advance, at_rest, residual
+from tpcd.robot.admittance import (
+    AdmittanceState,
+    advance,
+    at_rest,
+    for_new_command,
+    residual,
+    travel_time,
+)
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.frames import TaskFrame, planar_pose, planar_wrench
 from tpcd.robot.frames import tcp_pose as tcp_of
@@ -100,7 +107,7 @@ class Servo:
             steps = max(np.hypot(way[0], way[1]), abs(way[2]) / 10) / RAMP_SPEED * link.rate
             waited += steps < 1
             reference = state.reference + way / max(1.0, float(steps))
-            self.state = AdmittanceState(reference, np.zeros(3), wrench)
+            self.state = at_rest(reference, wrench)
             link.servo(tcp_of(frame, reference))
 
     def retreat(self) -> Float[np.ndarray, " 3"]:
@@ -129,6 +136,8 @@ class Servo:
         link, frame = self.link, self.frame
         assert self.state is not None, "start first"
         window, last, began = Window(self.settling, self.noise), None, None
+        self.state = for_new_command(self.state)
+        longest = self.settings.settle_time + travel_time(self._law, self.state, command)
         count, still = 0, None
         while still is None:
             sample, pose, wrench = self.read()
@@ -148,7 +157,7 @@ class Servo:
                     f" state less than {self.settings.surface_mm_per_10n:g} mm per 10 N"
                 )
             still = window.still()
-            if still is None and sample.stamp - began > self.settings.settle_time:
+            if still is None and sample.stamp - began > longest:
                 break
         settled = still is not None
         still = still or window.mean()

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from eval.bench.contact_problems import ContactRecipe, random_contact_problems
-from tpcd.errors import SolverError
 from tpcd.qp import ContactQP, Status, solve
+from tpcd.qp.problem import select
 
 pytest.importorskip("qpth", reason="the extra qpth is not installed")
 
@@ -76,8 +76,41 @@ def test_every_batch_shape_is_answered_in_kind(batch, m):
     torch.testing.assert_close(answer.motion, expected, rtol=0, atol=1e-4)
 
 
-def test_gradients_are_refused_with_the_way_out():
-    problem = random_contact_problems(2, 4, 5)
-    target = problem.target.clone().requires_grad_()
-    with pytest.raises(SolverError, match="use engine='exact'"):
-        solve(replace(problem, target=target), "qpth")
+def gradients(problem: ContactQP, engine: str) -> tuple[torch.Tensor, ...]:
+    """Of a weighted motion and resultant, in what all rows share: the share of each of redundant
+    rows is not unique, neither in force nor in gradient."""
+    eye = torch.eye(3, dtype=torch.float64)
+    leaves = [t.clone().requires_grad_() for t in (problem.hessian, problem.target, eye, eye[0, 1])]
+    hessian, target, turn, lift = leaves
+    moved = replace(
+        problem,
+        hessian=hessian,
+        target=target,
+        rows=problem.rows @ turn,
+        offsets=problem.offsets + lift,
+    )
+    solution = solve(moved, engine)
+    pushed = (moved.rows * solution.multipliers[..., None]).sum(-2)
+    weights = torch.tensor([1.0, -2.0, 0.3], dtype=torch.float64)
+    total = (solution.motion * weights).sum() + 1e-4 * (pushed * weights).square().sum()
+    return torch.autograd.grad(total, leaves)
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_gradients_are_those_of_the_exact_engine(copies: int) -> None:
+    problem = random_contact_problems(300, 8, 5)
+    exact, other = solve(problem, "exact"), solve(problem, "qpth")
+    # Where qpth is accurate, and no row is touched without force.
+    same = ((exact.multipliers > 1e-6) == exact.active).all(-1)
+    force = ((other.motion - exact.motion) @ problem.hessian).abs().amax(-1)
+    problem = select(problem, exact.solved & other.solved & same & (force < 1e-7))
+    assert problem.batch_shape[0] > 200 and exact.active.sum(-1).max() > 1
+    assert problem.row_mask is not None
+    more = replace(
+        problem,
+        rows=problem.rows.repeat(1, copies, 1),
+        offsets=problem.offsets.repeat(1, copies),
+        row_mask=problem.row_mask.repeat(1, copies),
+    )
+    for mine, theirs in zip(gradients(more, "qpth"), gradients(problem, "exact"), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-6)

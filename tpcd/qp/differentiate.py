@@ -17,14 +17,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from tpcd.qp.elastic import elastic_compliance
 from tpcd.qp.problem import ContactQP, QPSolution, Status
 
 
-def attach_gradients(problem: ContactQP, solution: QPSolution) -> QPSolution:
+def attach_gradients(
+    problem: ContactQP, solution: QPSolution, active: Bool[Tensor, "*batch m"]
+) -> QPSolution:
     """The same solution, its motion and multipliers connected to the problem's inputs.
+
+    `active` are its active rows, linearly independent where no compliance makes them so.
 
     The values stay those of the engine, bit for bit. Elements without an answer
     (INVALID_INPUT, INFEASIBLE) get zero gradients, and so do inactive and padded rows.
@@ -32,7 +37,7 @@ def attach_gradients(problem: ContactQP, solution: QPSolution) -> QPSolution:
     relaxed = solution.status == int(Status.RELAXED)
     answered = (solution.status == int(Status.SOLVED)) | relaxed
     answered = answered | (solution.status == int(Status.ITERATION_LIMIT))
-    motion, multipliers = _equality_solution(problem, solution.active, answered, relaxed)
+    motion, multipliers = _equality_solution(problem, active, answered, relaxed)
     return replace(
         solution,
         motion=_with_gradient(solution.motion, motion),

@@ -18,12 +18,13 @@ import io
 from importlib.util import find_spec
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from tpcd.errors import SolverError
 from tpcd.qp.exact import ActiveSet
-from tpcd.qp.problem import Status
-from tpcd.qp.whitening import WhitenedQP
+from tpcd.qp.problem import ContactQP, QPSolution, Status
+from tpcd.qp.whitening import WhitenedQP, whiten
 
 FAR = 3.0
 """Offset of padded rows, in units of the problem's largest offset."""
@@ -31,6 +32,8 @@ ACCURACY = 1e-6
 """Largest residual, in units of the problem's largest offset, that is reported as SOLVED."""
 ROUNDS = 4
 """How often the inaccurate elements are solved again, each time without the accurate."""
+DEPENDENT = 1e-3
+"""A unit row is made up of others where they leave no more of it than this length."""
 STEPS = 20
 """qpth's own limit of steps in one round; it stops earlier when three brought nothing."""
 
@@ -82,6 +85,29 @@ def solve_qpth(problem: WhitenedQP) -> ActiveSet:
     status = torch.where(residual <= ACCURACY, int(Status.SOLVED), int(Status.ITERATION_LIMIT))
     status = torch.where(impossible, int(Status.INFEASIBLE), status)
     return ActiveSet(motion * size, force * size, active, status, steps)
+
+
+def independent_rows(problem: ContactQP, solution: QPSolution) -> Bool[Tensor, "*batch m"]:
+    """Active rows of an answer without those that others make up; large forces come first.
+
+    Duplicates share a force here, so that more rows are active than the motion has directions.
+    Elements with the elastic fallback keep all: springs make their rows independent.
+    """
+    whitened = whiten(problem)
+    active = solution.active.reshape(-1, problem.row_count).T
+    force = solution.multipliers.reshape(-1, problem.row_count).T * whitened.lengths
+    left = whitened.rows.where(active, 0.0)
+    chosen = torch.zeros_like(active)
+    for _ in range(min(left.shape[:2])):
+        length = left.square().sum(0).sqrt()
+        size, best = force.where(length > DEPENDENT, 0.0).max(0)
+        best = best[None]
+        chosen |= torch.zeros_like(chosen).scatter(0, best, (size > 0)[None])
+        unit = left.take_along_dim(best[None], 1) / length.gather(0, best).clamp_min(DEPENDENT)
+        left = left - unit * (unit * left).sum(0)
+    chosen = chosen.T.reshape(solution.active.shape)
+    relaxed = (solution.status == int(Status.RELAXED))[..., None]
+    return torch.where(relaxed, solution.active, chosen)
 
 
 def _residual(rows: Tensor, offsets: Tensor, motion: Tensor, force: Tensor) -> Tensor:

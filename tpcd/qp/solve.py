@@ -34,7 +34,7 @@ def solve(
     `qpth` (interior point of the qpth package, about 0.1 N accurate), or `auto`: `native`
     on the CPU where numba is installed and no gradient is asked, else `exact`. All compute
     in float64 and answer in the problem's dtype. Motion and multipliers are differentiable
-    (twice) with respect to every floating input, whatever the engine but qpth.
+    (twice) with respect to every floating input, whatever the engine.
 
     Infeasible elements are answered by the elastic fallback (status RELAXED), or by NaN
     with status INFEASIBLE where `elastic` is False. Elements with NaN or without a
@@ -42,7 +42,7 @@ def solve(
     affects another. `iteration_limit` bounds the steps of one element.
 
     Raises ValueError or TypeError where shapes, dtypes or devices do not fit, and
-    SolverError where the engine is not installed or cannot serve the request.
+    SolverError where the engine is not installed.
     """
     check_problem(problem)
     if engine not in ENGINES:
@@ -52,13 +52,18 @@ def solve(
         on_cpu = problem.target.device.type == "cpu"
         native = on_cpu and not wants_gradient and native_available()
         engine = "native" if native else "exact"
-    if engine == "qpth" and wants_gradient:
-        raise SolverError("engine qpth gives no gradients here; use engine='exact' for them")
     with torch.no_grad():
         solution = _solve_flat(problem, engine, iteration_limit)
         if elastic:
             solution = _answer_infeasible(problem, solution, engine, iteration_limit)
-    return attach_gradients(problem, solution) if wants_gradient else solution
+    if not wants_gradient:
+        return solution
+    active = solution.active
+    if engine == "qpth":
+        from tpcd.qp.qpth_engine import independent_rows
+
+        active = independent_rows(problem, solution)
+    return attach_gradients(problem, solution, active)
 
 
 def native_available() -> bool:

@@ -28,6 +28,7 @@ from tpcd.truth.diagnosis_motion import (
     UP,
     Move,
     above,
+    climb,
     corner,
     facing_wall,
     nudge,
@@ -166,8 +167,9 @@ def _moves() -> Iterator[Step]:
 def _visits(side: float) -> list[list[Step]]:
     left, right, middle = PLACES[0], PLACES[2], PLACES[1]
     return [
-        [_press(MEDIUM), _slide(LEFT, MEDIUM), _slide(RIGHT, MEDIUM), _tilt(side)],
-        [_facing(), _wall_press(MEDIUM), _wall_slide(UP, MEDIUM), _wall_slide(DOWN, MEDIUM)],
+        [_press(HARD), _slide(LEFT, MEDIUM), _slide(RIGHT, MEDIUM), _hold(LEFT)],
+        [_facing(), _wall_press(MEDIUM), _corner(HARD, HARD, side), _climb(HARD)],
+        [_wall_slide(DOWN, LIGHT), _wall_slide(UP, HARD)],
         _free(middle, side),
         [
             _over(middle),
@@ -239,6 +241,10 @@ def _wall_press(load: float) -> Step:
 def _wall_slide(direction: float, load: float) -> Step:
     way = "up" if direction > 0 else "down"
     return f"slide {way} the wall at {load:g} N", wall_slide(direction, load)
+
+
+def _climb(load: float) -> Step:
+    return f"climb the wall at {load:g} N", climb(load)
 
 
 def _corner(wall_load: float, floor_load: float, side: float = 0.0) -> Step:

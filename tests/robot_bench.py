@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet
+import torch
 
 from tpcd.robot.admittance import AdmittanceSettings, at_rest
 from tpcd.robot.arm_settings import ArmSettings
@@ -24,6 +27,18 @@ from tpcd.robot.ur import UniversalRobot
 _COUNT = itertools.count(1)
 SURFACE = 5.0
 """Yield of floor and wall [mm per 10 N]: soft, so that the arm settles soon."""
+
+
+def command(x: float, z: float, angle: float = 0.0) -> torch.Tensor:
+    """Of an impedance [m, m, rad]."""
+    return torch.tensor([x, z, angle], dtype=torch.float64)
+
+
+def raw_of(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict]:
+    """The columns of a raw recording, and what is said about it."""
+    table = pyarrow.parquet.read_table(folder / f"{name}.parquet")
+    columns = {key: table[key].to_numpy() for key in table.column_names}
+    return columns, json.loads(table.schema.metadata[b"tpcd"])
 
 
 def free_address() -> str:

@@ -1,0 +1,132 @@
+"""What goes wrong with an arm: faults of the controller, readings that must stop it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robot_bench import arm_with, command, raw_of
+
+from tpcd.errors import RobotError
+from tpcd.robot.admittance import at_rest
+from tpcd.robot.arm_settings import ArmSettings
+from tpcd.robot.frames import task_frame, tcp_pose
+from tpcd.robot.link import Link, Sample
+from tpcd.robot.raw import RawRecord
+from tpcd.robot.servo import Servo
+from tpcd.robot.ur import UniversalRobot
+
+pytest.importorskip("rtde_control")
+
+
+def press_until_it_fails(arm: UniversalRobot) -> tuple[str, float]:
+    """Start, and press and let go until an error; its text, and when it came."""
+    x, z, _ = arm.start().poses[0].tolist()
+    assert arm._link is not None
+    arm._link.stale_time = 0.04
+    with pytest.raises(RobotError) as caught:
+        for _ in range(20):
+            arm.settle(command(x, z - 0.05))
+            arm.settle(command(x, z))
+    return str(caught.value), time.monotonic()
+
+
+def test_a_protective_stop_ends_the_move(tmp_path: Path) -> None:
+    with arm_with(tmp_path, fault="protective_stop") as arm:
+        text, _ = press_until_it_fails(arm)
+    assert "protective stop" in text and "holds its place" in text
+    _, about = raw_of(tmp_path, sorted(tmp_path.glob("row_*"))[-1].stem)
+    assert "protective stop" in about["ended"]
+
+
+@pytest.mark.parametrize("fault", ["frozen_link", "killed_controller"])
+def test_a_lost_link_is_noticed_at_once_though_the_client_serves_the_last_pose(
+    fault: str, tmp_path: Path
+) -> None:
+    began = time.monotonic()
+    with arm_with(tmp_path, fault=fault) as arm:
+        text, noticed = press_until_it_fails(arm)
+        closing = time.monotonic()
+        arm.close()
+        assert time.monotonic() - closing < 15.0
+    assert "no new reading for 40 ms" in text and "holds its last target" in text
+    columns, about = raw_of(tmp_path, sorted(tmp_path.glob("row_*"))[-1].stem)
+    # 40 ms, and what a busy machine adds; until the error had come through all.
+    assert 0.035 < noticed - columns["received"][-1] < 0.5
+    assert "no new reading" in about["ended"] and began < noticed
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("wrong_payload", "payload is wrong by about 0.[78]"),
+        ("drifting_sensor", r"drifts by 0\.[56]"),
+    ],
+)
+def test_a_sensor_that_zeroing_does_not_mend_is_refused(
+    fault: str, said: str, tmp_path: Path
+) -> None:
+    with arm_with(tmp_path, fault=fault) as arm, pytest.raises(RobotError, match=said):
+        arm.start()
+
+
+def test_a_surface_stiffer_than_stated_is_detected_and_left(tmp_path: Path) -> None:
+    with arm_with(tmp_path, {"surface_mm_per_10n": 12.0}, surface_mm_per_10n=1.0) as arm:
+        x, z, _ = arm.start().poses[0].tolist()
+        with pytest.raises(RobotError, match="oscillates.*state less than 12 mm|beyond the limit"):
+            arm.settle(command(x, z - 0.07))
+        assert arm.at_rest == "the arm has retreated"
+
+
+class StubLink(Link):
+    """Samples as given, with no controller behind."""
+
+    def __init__(self, samples: list[Sample]) -> None:
+        self.alive, self.rate, self._samples = True, 125.0, samples
+
+    def next_sample(self) -> Sample:
+        return self._samples.pop(0)
+
+    def servo(self, target: object) -> None:
+        pass
+
+
+def test_the_force_limit_holds_again_after_a_retreat_that_fails() -> None:
+    frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
+    place = np.array([0.1, 0.1, 0.0])
+    tcp = tcp_pose(frame, place)
+    forces = (25.0, 40.0, 25.0, 25.0)
+    samples = [
+        Sample(0.008 * k, tcp, np.array([0.0, 0.0, force, 0.0, 0.0, 0.0]), tcp, 0.0)
+        for k, force in enumerate(forces)
+    ]
+    servo = Servo(ArmSettings("nowhere"), StubLink(samples), frame, RawRecord())
+    servo.state = at_rest(place, np.zeros(3))
+    with pytest.raises(RobotError, match="met a force of 40"):
+        servo.retreat()
+    with pytest.raises(RobotError, match="beyond the limit of 20 N"):
+        for _ in range(2):
+            servo.read()
+
+
+@pytest.mark.parametrize(
+    ("pose", "force", "said"),
+    [
+        ((0.31, 0.1, 0.0), 0.0, "outside of the workspace"),
+        ((0.1, 0.1, 0.0), 25.0, "beyond the limit of 20 N"),
+        ((0.2, 0.1, 0.0), 0.0, "does not follow"),
+    ],
+)
+def test_single_readings_are_guarded(pose: tuple, force: float, said: str) -> None:
+    frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
+    wrench = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
+    tcp = tcp_pose(frame, np.array(pose))
+    samples = [Sample(0.008 * k, tcp, wrench, tcp, 0.0) for k in range(3)]
+    servo = Servo(ArmSettings("nowhere"), StubLink(samples), frame, RawRecord())
+    if said == "does not follow":
+        servo.state = at_rest(np.array([0.1, 0.1, 0.0]), np.zeros(3))
+    with pytest.raises(RobotError, match=said):
+        for _ in range(3):
+            servo.read()

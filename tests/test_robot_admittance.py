@@ -140,13 +140,34 @@ def test_noise_alone_is_neither_motion_nor_oscillation() -> None:
     still = 0
     for _ in range(200):
         window = Window(SettlingSettings(), noise)
-        for count in range(80):
+        taken = None
+        for count in range(160):
             drawn = generator.normal(0, 1, 3) * noise
             pose = generator.normal(0, (2e-5, 2e-5, 5e-5))
             window.add(count * 0.008, pose, drawn, drawn)
+            if count >= 75 and taken is None:
+                taken = window.still()
         assert not window.unstable()
-        still += window.still() is not None
+        still += taken is not None
     assert still >= 180
+
+
+def test_what_is_taken_is_the_window_after_the_first_still_one() -> None:
+    """An approach with a time constant of 0.2 s is within the tolerance while it still goes on."""
+    window, first = Window(SettlingSettings(), np.full(3, 1e-3)), None
+    for count in range(400):
+        time = count * 0.008
+        away = 0.03 * np.exp(-time / 0.2)
+        pose, force = np.array([-away, 0.0, 0.0]), np.array([100 * away, 0.0, 0.0])
+        window.add(time, pose, np.zeros(3), force)
+        rows = np.array(window._rows)
+        if first is None and window.full and np.abs(rows[:, 7:10].mean(0)).max() < 0.03:
+            first = float(-rows[:, 1].mean())
+        taken = window.still()
+        if taken is not None:
+            break
+    assert taken is not None and first is not None
+    assert 2e-4 < first < 3e-4 and abs(float(taken.pose[0])) < first / 10
 
 
 def test_a_slow_approach_is_not_still() -> None:

@@ -135,14 +135,15 @@ def row_noise(
     """Standard deviations of a row, from readings in free air and the force that `turning` the
     tool leaves [N].
 
-    A row is taken once the mean wrench is K (r - u) to within what counts as still, so the fast
-    noise of the force is no longer in the force: the spring has turned it into motion, in free air
-    in full and in contact, damped more, hardly; half of it is taken.
+    At rest the mean wrench is K (r - u), fast noise and all: in free air the spring has turned that
+    noise into motion, in contact, where the arm is damped more, hardly. So half of it is taken for
+    the pose, and all of it for the wrench, besides half of what may be left where a row counts as
+    still.
     """
     fast, slow = mean_noise(air, settling.window)
     still = 0.5 * np.array(settling.residual)
     moved = np.sqrt(still**2 + (0.5 * fast[3:]) ** 2 + slow[3:] ** 2) / stiffness
     pose_std = np.sqrt(fast[:3] ** 2 + slow[:3] ** 2 + moved**2)
-    wrench_std = np.hypot(still, slow[3:])
+    wrench_std = np.sqrt(still**2 + fast[3:] ** 2 + slow[3:] ** 2)
     wrench_std[:2] = np.hypot(wrench_std[:2], 0.5 * turning)
     return np.concatenate((pose_std, wrench_std))

@@ -1,8 +1,8 @@
 """When an arm has settled, and when its force control has gone unstable.
 
-Both look at a window of recent readings. A sample is taken once pose and wrench no longer move
-and nothing is left that would move them, however long that takes. A loop that is unstable with a
-delayed surface shows an oscillation of the wrench that does not die out.
+Both look at a window of recent readings. A sample is the window after the one in which pose and
+wrench no longer moved and nothing was left that would move them, however long that takes. A loop
+that is unstable with a delayed surface shows an oscillation of the wrench that does not die out.
 """
 
 from __future__ import annotations
@@ -57,6 +57,8 @@ class Window:
     def __init__(self, settings: SettlingSettings, noise: Float[np.ndarray, " 3"]) -> None:
         self.settings, self._noise = settings, noise
         self._rows: deque[np.ndarray] = deque()
+        self._rested: float | None = None
+        """Stamp of the end of that first window."""
 
     def add(
         self,
@@ -77,21 +79,25 @@ class Window:
         return len(rows) > 8 and float(rows[-1][0] - rows[0][0]) > 0.9 * self.settings.window
 
     def still(self) -> Still | None:
-        """The means, if pose and force are steady and nothing is left to move them."""
+        """The means of the window after the first one in which pose and force were steady and
+        nothing was left to move them; what still comes nearer then is off to the same side."""
         if not self.full:
             return None
         rows, settings = np.array(self._rows), self.settings
+        now = float(rows[-1, 0])
+        if self._rested is not None:
+            return self.mean() if now - self._rested >= 0.98 * settings.window else None
+        if self._steady(rows) and (np.abs(rows[:, 7:10].mean(0)) <= settings.residual).all():
+            self._rested = now
+        return None
+
+    def _steady(self, rows: Float[np.ndarray, "k c"]) -> bool:
+        settings = self.settings
         half = len(rows) // 2
         change = np.abs(rows[half:].mean(0) - rows[:half].mean(0))
-        noise = settings.noise_factor * self._noise
-        if (change[1:4] > settings.pose_change).any():
-            return None
-        if (change[4:7] > settings.wrench_change + noise * np.sqrt(2 / half)).any():
-            return None
-        left = np.abs(rows[:, 7:10].mean(0))
-        if (left > settings.residual).any():
-            return None
-        return self.mean()
+        noise = settings.noise_factor * self._noise * np.sqrt(2 / half)
+        moved = (change[1:4] > settings.pose_change).any()
+        return not (moved or (change[4:7] > settings.wrench_change + noise).any())
 
     def mean(self) -> Still:
         """The means, whether still or not; raises ValueError where nothing was read."""

@@ -9,7 +9,8 @@ import pytest
 from command_calls import PRIOR
 from robot_bench import free_address
 
-from eval.physical import ORIGIN, WALL_BASE, Physical, evaluate_physical
+from eval.physical import Physical, evaluate_physical
+from eval.physical_sessions import ORIGIN, WALL_BASE
 from tpcd.data.episode import read_episode
 
 

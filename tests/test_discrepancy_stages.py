@@ -97,3 +97,39 @@ def test_a_look_is_at_effects_that_the_data_excite_or_at_the_others(
         naming._glances(bench, fit, CATALOGUE, 1, False, False)
         assert set(looked) == others
         assert bench.candidates == []  # what is tried says how it fared
+
+
+@pytest.mark.parametrize(
+    ("shape", "numerics", "rival", "chosen"),
+    [
+        (12.0, 0.0, 10.0, "wide_shape"),
+        (9.0, 0.0, 10.0, None),
+        (5.0, 0.0, None, None),
+        (0.0, 12.0, 10.0, None),
+        (0.0, 17.0, 10.0, "relaxed_friction"),
+    ],
+)
+def test_another_shape_need_only_be_as_good_as_an_effect(
+    shape: float, numerics: float, rival: float | None, chosen: str | None, episode, monkeypatch
+) -> None:
+    """Gains over the base model; 6 is asked for."""
+    known = PolygonShape(builtin_outlines()["mug"])
+    question = Question(
+        joined_history([episode]), make_prior(known), MisfitField(0.0), StepSettings(),
+        SETTINGS.sampler,
+    )  # fmt: skip
+    bench = Workbench(question, SETTINGS, coverage_of([episode]), 0, lambda line: None)
+
+    def fit(gain: float) -> Fit:
+        return Fit((), question.step, question.scene, (100.0 + gain,), ())
+
+    def fitted(asked: Question, *_, **__) -> Fit:
+        if asked.step.friction == "anitescu":
+            return fit(numerics)
+        return fit(0.0 if asked.step != question.step else shape)
+
+    monkeypatch.setattr(naming, "fit_model", fitted)
+    monkeypatch.setattr(Workbench, "adequacy", lambda *_: Adequacy(0.3, 1e-9, 0.5, ()))
+    found = naming.better_base(bench, fit(0.0), None if rival is None else fit(rival))
+    assert (None if found is None else found[0].name) == chosen
+    assert SETTINGS.least_gain == 6.0

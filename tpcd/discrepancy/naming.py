@@ -175,8 +175,9 @@ def better_base(
     bench: Workbench, current: Fit, rival: Fit | None
 ) -> tuple[Variant, Question] | None:
     """The variant of the base model that explains the data best, if it does so better than the
-    model as it is and the `rival`, the best candidate. After an effect only the shape is asked
-    about: what numerics do would have shown before it."""
+    model as it is and the `rival`, the best candidate. Another shape need only be as good as the
+    rival: an effect that is there is found beside it, and one that is not would stand for it. After
+    an effect only the shape is asked about: what numerics do would have shown before it."""
     found: list[tuple[float, Variant, Question]] = []
     enough = rival is not None and bench.adequacy(rival).adequate(bench.settings.level)
     first = len(current.effects) == bench.given
@@ -195,8 +196,10 @@ def better_base(
     if not found:
         return None
     evidence, variant, question = max(found, key=lambda one: one[0])
-    reached = [current.log_evidence, *([] if rival is None else [rival.log_evidence])]
-    return (variant, question) if evidence >= max(reached) + bench.settings.least_gain else None
+    least = bench.settings.least_gain
+    reached = -math.inf if rival is None else rival.log_evidence
+    reached += 0.0 if variant is WIDE_SHAPE else least
+    return (variant, question) if evidence >= max(current.log_evidence + least, reached) else None
 
 
 def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:

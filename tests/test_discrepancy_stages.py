@@ -130,6 +130,6 @@ def test_another_shape_need_only_be_as_good_as_an_effect(
 
     monkeypatch.setattr(naming, "fit_model", fitted)
     monkeypatch.setattr(Workbench, "adequacy", lambda *_: Adequacy(0.3, 1e-9, 0.5, ()))
-    found = naming.better_base(bench, fit(0.0), None if rival is None else fit(rival))
+    found = naming.better_base(bench, fit(0.0), None if rival is None else fit(rival), False)
     assert (None if found is None else found[0].name) == chosen
     assert SETTINGS.least_gain == 6.0

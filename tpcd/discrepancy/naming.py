@@ -172,16 +172,17 @@ def name_one(
 
 
 def better_base(
-    bench: Workbench, current: Fit, rival: Fit | None
+    bench: Workbench, current: Fit, rival: Fit | None, explained: bool
 ) -> tuple[Variant, Question] | None:
     """The variant of the base model that explains the data best, if it does so better than the
     model as it is and the `rival`, the best candidate. Another shape need only be as good as the
-    rival: an effect that is there is found beside it, and one that is not would stand for it. After
-    an effect only the shape is asked about: what numerics do would have shown before it."""
+    rival: an effect that is there is found beside it, and one that is not would stand for it. Only
+    the shape is asked about after an effect, since what numerics do would have shown before it, and
+    where the model has `explained` the data, which numerics would not."""
     found: list[tuple[float, Variant, Question]] = []
     enough = rival is not None and bench.adequacy(rival).adequate(bench.settings.level)
     first = len(current.effects) == bench.given
-    for variant in VARIANTS if first else (WIDE_SHAPE,):
+    for variant in VARIANTS if first and not explained else (WIDE_SHAPE,):
         if enough and variant is FINER_STEPS:
             continue  # slow, and nothing is left for it to explain
         question = variant.change(bench.question)

@@ -135,8 +135,9 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             adequate = bench.adequacy(current).adequate(0.05)
             found = name_one(bench, current, pool, adequate, excited)
             untried = stage == 0 and not variants
-            if untried and not _explains(bench, found.base):
-                changed = _changed_base(bench, found)
+            explained = _explains(bench, found.base)
+            if untried and not (explained and found.best is None):
+                changed = _changed_base(bench, found, explained)
                 if changed is not None:
                     variant, current = changed
                     bare = len(current.effects) == bench.given
@@ -165,10 +166,10 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     return Findings(base, current, before, after, tuple(close), tuple(variants))
 
 
-def _changed_base(bench: Workbench, found: Round) -> tuple[Variant, Fit] | None:
+def _changed_base(bench: Workbench, found: Round, explained: bool) -> tuple[Variant, Fit] | None:
     """Another base model where one explains the data better than any effect, fitted well; what
     is asked from then on is asked of it."""
-    better = better_base(bench, found.base, found.best)
+    better = better_base(bench, found.base, found.best, explained)
     if better is None:
         return None
     variant, bench.question = better

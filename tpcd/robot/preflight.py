@@ -135,15 +135,13 @@ def row_noise(
     """Standard deviations of a row, from readings in free air and the force that `turning` the
     tool leaves [N].
 
-    At rest the mean wrench is K (r - u), fast noise and all: in free air the spring has turned that
-    noise into motion, in contact, where the arm is damped more, hardly. So half of it is taken for
-    the pose, and all of it for the wrench, besides half of what may be left where a row counts as
-    still.
+    At rest the mean wrench is K (r - u), noise and all, to within a quarter of what may be left
+    where a row counts as still (measured on the emulator). In free air the spring has turned all of
+    that into motion; in contact it has not, so that poses are better there than stated.
     """
     fast, slow = mean_noise(air, settling.window)
-    still = 0.5 * np.array(settling.residual)
-    moved = np.sqrt(still**2 + (0.5 * fast[3:]) ** 2 + slow[3:] ** 2) / stiffness
-    pose_std = np.sqrt(fast[:3] ** 2 + slow[:3] ** 2 + moved**2)
+    still = 0.25 * np.array(settling.residual)
     wrench_std = np.sqrt(still**2 + fast[3:] ** 2 + slow[3:] ** 2)
+    pose_std = np.sqrt(fast[:3] ** 2 + slow[:3] ** 2 + (wrench_std / stiffness) ** 2)
     wrench_std[:2] = np.hypot(wrench_std[:2], 0.5 * turning)
     return np.concatenate((pose_std, wrench_std))

@@ -74,6 +74,12 @@ def test_every_batch_shape_is_answered_in_kind(batch, m):
     assert answer.motion.shape == (*batch, 3) and answer.multipliers.shape == (*batch, m)
     expected = solve(problem, "exact").motion
     torch.testing.assert_close(answer.motion, expected, rtol=0, atol=1e-4)
+    leaf = target.clone().requires_grad_()
+    assert (
+        torch.autograd.grad(solve(replace(problem, target=leaf), "qpth").motion.sum(), leaf)[0]
+        .isfinite()
+        .all()
+    )
 
 
 def gradients(problem: ContactQP, engine: str) -> tuple[torch.Tensor, ...]:
@@ -114,3 +120,20 @@ def test_gradients_are_those_of_the_exact_engine(copies: int) -> None:
     )
     for mine, theirs in zip(gradients(more, "qpth"), gradients(problem, "exact"), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-6)
+
+
+def test_gradients_of_stiff_springs_keep_every_row() -> None:
+    jamming = ContactRecipe(friction=(1.1, 1.6), gaps=(-0.003, 0.001), wall_share=0.5)
+    problem = random_contact_problems(200, 8, 3, jamming)
+    soft = replace(problem, compliance=torch.full_like(problem.offsets, 1e-8))
+    exact, other = solve(soft, "exact"), solve(soft, "qpth")
+    force = ((other.motion - exact.motion) @ problem.hessian).abs().amax(-1)
+    same = (exact.active == other.active).all(-1) & exact.solved & other.solved
+    soft = select(soft, same & (force < 1e-6))
+    assert soft.batch_shape[0] > 50
+    found = []
+    for engine in ("exact", "qpth"):
+        leaf = soft.target.clone().requires_grad_()
+        motion = solve(replace(soft, target=leaf), engine).motion
+        found.append(torch.autograd.grad(motion.sum(), leaf)[0])
+    torch.testing.assert_close(found[1], found[0], rtol=1e-4, atol=1e-6)

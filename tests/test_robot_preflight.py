@@ -15,7 +15,9 @@ from tpcd.robot.preflight import (
     check_zeroed,
     mean_noise,
     reading_noise,
+    row_noise,
 )
+from tpcd.robot.settling import SettlingSettings
 
 RATE, NOISE = 125.0, np.array([0.2, 0.2, 0.01])
 
@@ -82,3 +84,16 @@ def test_slow_noise_is_told_apart() -> None:
     fast, slow = mean_noise(swaying, 0.6)
     assert 0.15 < slow[3] < 0.3
     np.testing.assert_allclose(fast[3:], NOISE / np.sqrt(0.6 * RATE), rtol=0.1)
+
+
+def test_a_row_has_the_noise_of_a_window_s_mean_and_turns_it_into_motion() -> None:
+    """0.6 s of independent readings, a quarter of what may be left, half of what turning left."""
+    stiffness, count = np.array([100.0, 100.0, 50.0]), 0.6 * RATE
+    left = 0.25 * np.array(SettlingSettings().residual)
+    expected = np.sqrt(NOISE**2 / count + left**2)
+    found = row_noise(air(seconds=30.0), 0.0, SettlingSettings(), stiffness)
+    np.testing.assert_allclose(found[3:], expected, rtol=0.05)
+    np.testing.assert_allclose(found[:3], expected / stiffness, rtol=0.05)
+    turned = row_noise(air(seconds=30.0), 0.4, SettlingSettings(), stiffness)
+    np.testing.assert_allclose(turned[3:5], np.hypot(expected[:2], 0.2), rtol=0.05)
+    assert turned[5] == found[5]

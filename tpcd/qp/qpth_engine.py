@@ -91,11 +91,13 @@ def independent_rows(problem: ContactQP, solution: QPSolution) -> Bool[Tensor, "
     """Active rows of an answer without those that others make up; large forces come first.
 
     Duplicates share a force here, so that more rows are active than the motion has directions.
-    Elements with the elastic fallback keep all: springs make their rows independent.
+    Rows with a compliance and elements with the elastic fallback keep all: springs make them
+    independent.
     """
     whitened = whiten(problem)
-    active = solution.active.reshape(-1, problem.row_count).T
-    force = solution.multipliers.reshape(-1, problem.row_count).T * whitened.lengths
+    shape = problem.batch_shape.numel(), problem.row_count
+    active = solution.active.reshape(shape).T
+    force = solution.multipliers.reshape(shape).T * whitened.lengths
     left = whitened.rows.where(active, 0.0)
     chosen = torch.zeros_like(active)
     for _ in range(min(left.shape[:2])):
@@ -106,8 +108,10 @@ def independent_rows(problem: ContactQP, solution: QPSolution) -> Bool[Tensor, "
         unit = left.take_along_dim(best[None], 1) / length.gather(0, best).clamp_min(DEPENDENT)
         left = left - unit * (unit * left).sum(0)
     chosen = chosen.T.reshape(solution.active.shape)
-    relaxed = (solution.status == int(Status.RELAXED))[..., None]
-    return torch.where(relaxed, solution.active, chosen)
+    springs = (solution.status == int(Status.RELAXED))[..., None]
+    if problem.compliance is not None:
+        springs = springs | (problem.compliance > 0)
+    return torch.where(springs, solution.active, chosen)
 
 
 def _residual(rows: Tensor, offsets: Tensor, motion: Tensor, force: Tensor) -> Tensor:

@@ -40,13 +40,18 @@ LEVER = 0.2
 """Damping of the angle is that of a surface point so far from the end effector [m]. Larger than a
 hand-held object, since flat faces are stiffer against turning than single points."""
 WAY = 0.0015
-"""A way on which the wrench has not changed is soft after so much of it [m]."""
+"""A way on which the wrench has not changed is soft after so much of it [m]. With `SLIGHT`, another
+direction is off it by 0.04 rad at most on a surface of 5 kN/m (emulated slides, 0.2 to 3 mm)."""
 BEGINNING = 0.3
 """Of a way, in which its direction is not taken [s]: what was pressed is still coming to rest."""
 SLIGHT = (0.3, 0.3, 0.03)
 """Change of the slowly filtered wrench that ends a soft way [N, N, N·m]."""
 SLOW_TIME = 0.05
 """Time constant of that filter [s]; faster changes end it where they exceed `touch`."""
+NOISE_FACTOR = 5.0
+"""Standard deviations of filtered noise that end no way."""
+MEMORY = 0.5
+"""Of the mean wrench of a way [s]: friction that changes slowly is followed."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,8 @@ class AdmittanceSettings:
     turn the lighter damping on and off."""
     filter_time: float = 0.005
     """Time constant of the filter of the wrench [s]."""
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Standard deviation of one reading of the wrench [N, N, N·m]."""
 
     def __post_init__(self) -> None:
         """Refuse what is no spring."""
@@ -130,7 +137,7 @@ class AdmittanceState:
     mark: Mark
     """The way on which it has not changed."""
     soft: Float[np.ndarray, " 3"] | None = None
-    """Direction of that way, of length 1 where damping is the metric; None: it is too short."""
+    """Direction of that way in x, z [m] and phi [rad], of any length; None: it is too short."""
     touched_at: Float[np.ndarray, " 3"] | None = None
     """The last reference at which a contact was felt, while it counts."""
 
@@ -192,9 +199,10 @@ def advance(
         if state.soft is not None:
             # D = H^1/2 (1 - (1 - d) n n') H^1/2, with d the lighter damping along n.
             root = np.sqrt(heavy)
-            lighter = float(state.soft @ (free / heavy * state.soft))
+            n = root * state.soft / np.linalg.norm(root * state.soft)
+            lighter = float(n @ (free / heavy * n))
             mean = force - state.wrench + state.mark.wrench
-            along = (1 / lighter - 1) * float(state.soft @ (mean / root)) * state.soft / root
+            along = (1 / lighter - 1) * float(n @ (mean / root)) * n / root
             velocity = _within(limit, velocity, along)
     return replace(state, reference=state.reference + step * velocity, velocity=velocity)
 
@@ -206,8 +214,9 @@ def _felt(
     step: float,
 ) -> AdmittanceState:
     """The state with a reading filtered, and what it says of contact and of the way."""
-    filtered = state.wrench + step / (settings.filter_time + step) * (wrench - state.wrench)
-    slow = state.slow + step / (SLOW_TIME + step) * (wrench - state.slow)
+    fast, gentle = (step / (time + step) for time in (settings.filter_time, SLOW_TIME))
+    filtered = state.wrench + fast * (wrench - state.wrench)
+    slow = state.slow + gentle * (wrench - state.slow)
     touched_at = state.touched_at
     if bool((np.abs(filtered) > settings.touch).any()):
         touched_at = state.reference
@@ -216,18 +225,22 @@ def _felt(
         if float(np.hypot(way[0], way[1])) > settings.release:
             touched_at = None
     mark, soft = state.mark, state.soft
-    changed = np.abs(slow - mark.wrench) > SLIGHT
-    if bool((changed | (np.abs(filtered - mark.wrench) > settings.touch)).any()):
+    noise = NOISE_FACTOR * np.array(settings.noise)
+    ends = (
+        (slow, np.maximum(SLIGHT, noise * np.sqrt(gentle / (2 - gentle)))),
+        (filtered, np.maximum(settings.touch, noise * np.sqrt(fast / (2 - fast)))),
+    )
+    if any(bool((np.abs(value - mark.wrench) > most).any()) for value, most in ends):
         mark, soft = Mark(state.reference, slow, SLOW_TIME), None
     else:
         age = mark.age + step
-        mark = replace(mark, wrench=mark.wrench + step / age * (wrench - mark.wrench), age=age)
+        mean = mark.wrench + step / min(age, MEMORY) * (wrench - mark.wrench)
+        mark = replace(mark, wrench=mean, age=age)
         if age < BEGINNING:
             mark = replace(mark, reference=state.reference)
-        way = np.sqrt(settings.damping) * (state.reference - mark.reference)
-        length = float(np.linalg.norm(way))
-        if length > WAY * np.sqrt(settings.damping[0]):
-            mark, soft = replace(mark, reference=state.reference), way / length
+        way = state.reference - mark.reference
+        if float(np.hypot(np.hypot(way[0], way[1]), LEVER * way[2])) > WAY:
+            mark, soft = replace(mark, reference=state.reference), way
     return replace(state, wrench=filtered, slow=slow, mark=mark, soft=soft, touched_at=touched_at)
 
 
@@ -235,8 +248,9 @@ def _within(
     limit: Float[np.ndarray, " 3"], base: Float[np.ndarray, " 3"], more: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, " 3"]:
     """`base` and as much of `more` as keeps each axis within its limit."""
-    room = np.where(more > 0, limit - base, limit + base)
-    share = float((np.maximum(room, 0.0) / np.maximum(np.abs(more), 1e-12)).min())
+    moves = np.abs(more) > 1e-9 * limit
+    room = np.maximum(limit - np.sign(more) * base, 0.0)
+    share = float(np.where(moves, room / np.where(moves, np.abs(more), 1.0), 1.0).min())
     return base + min(1.0, share) * more
 
 

@@ -6,6 +6,8 @@ recorded, whatever the arm is doing.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -136,18 +138,20 @@ class Servo:
         link, frame = self.link, self.frame
         assert self.state is not None, "start first"
         window, last, began = Window(self.settling, self.noise), None, None
+        law = replace(self._law, noise=tuple(self.noise.tolist()))
         self.state = for_new_command(self.state)
-        longest = self.settings.settle_time + travel_time(self._law, self.state, command)
+        longest = self.settings.settle_time + travel_time(law, self.state, command)
+        longest += self.settling.window  # which is taken after the first still one
         count, still = 0, None
         while still is None:
             sample, pose, wrench = self.read()
             began = sample.stamp if began is None else began
             passed = 1 / link.rate if last is None else sample.stamp - last
             last = sample.stamp
-            state = advance(self._law, self.state, command, wrench, min(passed, LARGEST_STEP))
+            state = advance(law, self.state, command, wrench, min(passed, LARGEST_STEP))
             self.state = state
             link.servo(tcp_of(frame, state.reference))
-            window.add(sample.stamp, pose, wrench, residual(self._law, state, command))
+            window.add(sample.stamp, pose, wrench, residual(law, state, command))
             count += 1
             if count % 12:
                 continue

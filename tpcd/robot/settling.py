@@ -22,6 +22,9 @@ class SettlingSettings:
     """Length of the window [s]."""
     pose_change: tuple[float, float, float] = (1e-4, 1e-4, 2e-4)
     """Largest difference between the mean poses of the window's halves."""
+    slack: float = 10.0
+    """Times as much in the window that is taken: in the air noise of the force moves the arm, but
+    not by as much as a slip."""
     wrench_change: tuple[float, float, float] = (0.08, 0.08, 0.004)
     """The same of the wrench, on top of what its noise makes."""
     residual: tuple[float, float, float] = (0.03, 0.03, 0.005)
@@ -86,17 +89,21 @@ class Window:
         rows, settings = np.array(self._rows), self.settings
         now = float(rows[-1, 0])
         if self._rested is not None:
-            return self.mean() if now - self._rested >= 0.98 * settings.window else None
-        if self._steady(rows) and (np.abs(rows[:, 7:10].mean(0)) <= settings.residual).all():
+            if now - self._rested < 0.98 * settings.window:
+                return None
+            if self._steady(rows, settings.slack):
+                return self.mean()
+            self._rested = None
+        elif self._steady(rows) and (np.abs(rows[:, 7:10].mean(0)) <= settings.residual).all():
             self._rested = now
         return None
 
-    def _steady(self, rows: Float[np.ndarray, "k c"]) -> bool:
+    def _steady(self, rows: Float[np.ndarray, "k c"], slack: float = 1.0) -> bool:
         settings = self.settings
         half = len(rows) // 2
         change = np.abs(rows[half:].mean(0) - rows[:half].mean(0))
         noise = settings.noise_factor * self._noise * np.sqrt(2 / half)
-        moved = (change[1:4] > settings.pose_change).any()
+        moved = (change[1:4] > slack * np.array(settings.pose_change)).any()
         return not (moved or (change[4:7] > settings.wrench_change + noise).any())
 
     def mean(self) -> Still:

@@ -226,7 +226,7 @@ def _hold(direction: float) -> Step:
     return f"push {'right' if direction > 0 else 'left'} at {HARD:g} N, too little to slide", move
 
 
-def _tilt(side: float, load: float = MEDIUM) -> Step:
+def _tilt(side: float, load: float) -> Step:
     return f"turn {'left' if side > 0 else 'right'} at {load:g} N on the floor", tilt(side, load)
 
 

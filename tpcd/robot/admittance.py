@@ -50,8 +50,9 @@ SLOW_TIME = 0.05
 """Time constant of that filter [s]; faster changes end it where they exceed `touch`."""
 NOISE_FACTOR = 5.0
 """Standard deviations of filtered noise that end no way."""
-MEMORY = 0.5
-"""Of the mean wrench of a way [s]: friction that changes slowly is followed."""
+MEMORY = 2.0
+"""Of the mean wrench of a way [s]: friction that changes slowly is followed; with 0.5 s noise takes
+slides on stiff surfaces a tenth of the friction too far (emulated)."""
 
 
 @dataclass(frozen=True)

@@ -41,9 +41,7 @@ def test_a_slide_settles_at_the_limit_of_friction(yields: float, longest: float)
         assert reading.settled and controller.time - began < longest
         force_x, force_z, _ = reading.wrench.tolist()
         # 0.2 N of noise over 75 readings is 0.023 N; half of it in what K (u - r) + w may leave.
-        # On a bare table a step of noise is a larger part of what friction can yield.
-        allowed = 0.08 if yields >= 1.0 else 0.12
-        assert force_x == pytest.approx(-np.sign(way) * friction * force_z, abs=allowed)
+        assert force_x == pytest.approx(-np.sign(way) * friction * force_z, abs=0.08)
 
 
 def test_a_slide_ends_where_it_does_without_the_lighter_damping() -> None:

@@ -50,9 +50,9 @@ SLOW_TIME = 0.05
 """Time constant of that filter [s]; faster changes end it where they exceed `touch`."""
 NOISE_FACTOR = 5.0
 """Standard deviations of filtered noise that end no way."""
-MEMORY = 2.0
-"""Of the mean wrench of a way [s]: friction that changes slowly is followed; with 0.5 s noise takes
-slides on stiff surfaces a tenth of the friction too far (emulated)."""
+MEMORY = 0.5
+"""Of the mean wrench of a way, as a share of D / K in contact, over which the heavier damping would
+average noise: shorter, and noise takes slides too far (emulated)."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,8 @@ def _felt(
         mark, soft = Mark(state.reference, slow, SLOW_TIME), None
     else:
         age = mark.age + step
-        mean = mark.wrench + step / min(age, MEMORY) * (wrench - mark.wrench)
+        memory = MEMORY * settings.damping[0] / settings.stiffness[0]
+        mean = mark.wrench + step / min(age, memory) * (wrench - mark.wrench)
         mark = replace(mark, wrench=mean, age=age)
         if age < BEGINNING:
             mark = replace(mark, reference=state.reference)

@@ -22,11 +22,11 @@ class SettlingSettings:
     """Length of the window [s]."""
     pose_change: tuple[float, float, float] = (1e-4, 1e-4, 2e-4)
     """Largest difference between the mean poses of the window's halves."""
-    slack: float = 10.0
-    """Times as much in the window that is taken: in the air noise of the force moves the arm, but
-    not by as much as a slip."""
     wrench_change: tuple[float, float, float] = (0.08, 0.08, 0.004)
     """The same of the wrench, on top of what its noise makes."""
+    slack: float = 10.0
+    """Times `pose_change` that are allowed in the window that is taken: in the air noise of the
+    force moves the arm, but not by as much as a slip."""
     residual: tuple[float, float, float] = (0.03, 0.03, 0.005)
     """Largest mean of K (u - r) + w over the window. Divided by K it is how far the arm may still
     be from rest where it slides or hangs free, so no noise is added to it: with more noise it

@@ -140,19 +140,6 @@ def test_noise_does_not_end_the_way() -> None:
     raise AssertionError("noise that is not known of ended no way")
 
 
-def test_friction_that_changes_slowly_is_followed() -> None:
-    """Friction grows by 0.25 N over 15 mm; the mean of the whole way would be 0.1 N behind."""
-    law = settings_for_surface(STIFFNESS, 5e3)
-    command = np.array([0.05, -0.02, 0.0])
-    state = at_rest(np.zeros(3), np.array([-1.2, 2.0, 0.0]))
-    for _ in range(1000):
-        grown = min(max(0.0, (state.reference[0] - 0.02) / 0.015), 1.0)
-        load = np.array([-1.2 - 0.25 * grown, 2.0, 0.0])
-        state = advance(law, state, command, load, 0.008)
-    assert state.in_contact
-    assert float(state.reference[0]) == pytest.approx(0.0355, abs=7e-4)
-
-
 def test_a_new_command_begins_a_new_way(monkeypatch: pytest.MonkeyPatch) -> None:
     servo, _ = wired_servo(surface_mm_per_10n=3.0)
     command = pressed(servo)

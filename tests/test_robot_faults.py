@@ -93,6 +93,23 @@ class StubLink(Link):
         pass
 
 
+class FollowingLink(Link):
+    """An arm that is where it is sent, and feels forces along z as given, then none."""
+
+    def __init__(self, tcp: np.ndarray, forces: tuple[float, ...]) -> None:
+        self.alive, self.rate, self._tcp, self._forces = True, 125.0, tcp, list(forces)
+        self._time = 0.0
+
+    def next_sample(self) -> Sample:
+        self._time += 1 / self.rate
+        force = self._forces.pop(0) if self._forces else 0.0
+        wrench = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
+        return Sample(self._time, self._tcp, wrench, self._tcp, 0.0)
+
+    def servo(self, target: np.ndarray) -> None:
+        self._tcp = target
+
+
 def test_the_force_limit_holds_again_after_a_retreat_that_fails() -> None:
     frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
     place = np.array([0.1, 0.1, 0.0])
@@ -109,6 +126,17 @@ def test_the_force_limit_holds_again_after_a_retreat_that_fails() -> None:
     with pytest.raises(RobotError, match="beyond the limit of 20 N"):
         for _ in range(2):
             servo.read()
+
+
+def test_a_force_about_the_limit_does_not_end_a_retreat() -> None:
+    """Noise takes it below the limit and above again."""
+    frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
+    place = np.array([0.1, 0.1, 0.0])
+    link = FollowingLink(tcp_pose(frame, place), (25.0, 19.0, 21.0, 21.0, 21.0))
+    servo = Servo(ArmSettings("nowhere"), link, frame, RawRecord())
+    servo.state = at_rest(place, np.zeros(3))
+    raised = servo.retreat() - place
+    np.testing.assert_allclose(raised, (0.0, ArmSettings("nowhere").retreat, 0.0), atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ class Servo:
         """Where the arm is sent; None while it is only read."""
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
-        self._over = 0
+        self._over, self._retreating = 0, False
 
     def read(self) -> tuple[Sample, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """The next reading, checked and recorded."""
@@ -64,7 +64,8 @@ class Servo:
         reference = pose if state is None else state.reference
         self._raw.add(sample, pose, wrench, reference)
         limit = self.settings.stop_force * np.array([1.0, 1.0, 0.2])
-        self._over = self._over + 1 if bool((np.abs(wrench) > limit).any()) else 0
+        over = bool((np.abs(wrench) > limit).any()) and not self._retreating
+        self._over = self._over + 1 if over else 0
         if self._over > 1:
             raise RobotError(
                 f"a wrench of ({wrench[0]:.1f}, {wrench[1]:.1f} N, {wrench[2]:.2f} N·m), beyond the"
@@ -120,7 +121,7 @@ class Servo:
         """
         assert self.state is not None, "never moved"
         settings, here = self.settings, self.state.reference
-        self._over = -(10**6)  # The limit may be exceeded still: the ramp looks to the force.
+        self._retreating = True  # The limit may be exceeded still: the ramp looks to the force.
         left = -1.0 if float(self.state.wrench[0]) < -1.0 else 0.0
         low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
         try:
@@ -130,7 +131,7 @@ class Servo:
                 self.ramp_to(goal, RETREAT_FORCE)
                 here = self.state.reference
         finally:
-            self._over = 0
+            self._retreating = False
         return here
 
     def settle(self, command: Float[np.ndarray, " 3"]) -> Reading:

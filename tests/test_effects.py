@@ -10,6 +10,7 @@ from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
+from tpcd.discrepancy.formula import FORMULAS
 from tpcd.effects import CATALOGUE, Effect
 from tpcd.effects.protocol import Added
 from tpcd.effects.truth import EffectTruth, added_effects
@@ -34,7 +35,13 @@ def vector(*values: float) -> Tensor:
 def run(hidden: dict[str, dict[str, float]], *commands: tuple[float, float, float]) -> Tensor:
     """Settled poses and readings (n, 6) of a box that starts 10 mm over the floor."""
     truth = EffectTruth(
-        BOX, FRICTION, 0.0, WALL_AT, STIFFNESS, added_effects(hidden), len(commands)
+        BOX,
+        FRICTION,
+        0.0,
+        WALL_AT,
+        STIFFNESS,
+        added_effects(hidden, (*CATALOGUE, *FORMULAS)),
+        len(commands),
     )
     truth.reset(vector(0.0, 0.01, 0.0))
     rows = []
@@ -93,6 +100,44 @@ def test_a_soft_wall_sinks_in_proportion_to_its_load() -> None:
     rows = run({"wall_compliance": {"compliance": 2.5e-4}}, (0.13, 0.05, 0), (0.15, 0.05, 0))
     sunk = rows[:, 0] + HALF - WALL_AT
     torch.testing.assert_close(sunk, -2.5e-4 * rows[:, 3], rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("surface", "hidden"),
+    [
+        ("floor", {"floor_compliance": {"compliance": 5e-4}}),
+        ("wall", {"wall_compliance": {"compliance": 5e-4}}),
+        ("floor", {"floor_height ~ root of load": {"slope": 1e-3}}),
+    ],
+)
+def test_what_sticks_to_a_soft_surface_stays_where_it_is_as_the_load_changes(
+    surface: str, hidden: dict[str, dict[str, float]]
+) -> None:
+    moves = ((0, 0.03, 0), (0, -0.02, 0), (0.006, -0.02, 0), (0.006, -0.07, 0), (0.006, -0.02, 0))
+    if surface == "wall":
+        moves = ((0, 0.05, 0), *((0.11 - z, 0.05 + x, 0.0) for x, z, _ in moves[1:]))
+    rows = run(hidden, *moves)[1:]
+    along, load = (0, 4) if surface == "floor" else (1, 3)
+    assert rows[2, load].abs() > rows[1, load].abs() + 3
+    torch.testing.assert_close(rows[1:, along], rows[:1, along].expand(3), rtol=0, atol=1e-6)
+
+
+def test_a_grip_on_a_soft_surface_keeps_its_way_through_other_loads() -> None:
+    """There and back: sideways force and yield are in proportion, whatever the load was."""
+    c = 5e-4
+    soft = {name: {"compliance": c} for name in ("floor_compliance", "tangential_compliance")}
+    commands = ((0, -0.03, 0), (0.006, -0.03, 0), (0.006, -0.07, 0), (-0.006, -0.05, 0))
+    rows = run(soft, *commands)
+    torch.testing.assert_close(rows[1:, 0], -c * rows[1:, 3], rtol=2e-3, atol=0)
+
+
+def test_in_the_corner_of_soft_surfaces_each_is_where_its_loads_leave_it() -> None:
+    c = 3e-4
+    names = ("floor_compliance", "wall_compliance", "tangential_compliance")
+    soft = {name: {"compliance": c} for name in names}
+    rows = run(soft, (0.08, -0.03, 0), (0.13, -0.03, 0), (0.15, -0.05, 0))
+    wall_load = -(rows[1:, 3] + FRICTION * rows[1:, 4])  # it came sliding
+    torch.testing.assert_close(rows[1:, 0] + HALF - WALL_AT, c * wall_load, rtol=0, atol=1e-4)
 
 
 def test_a_contact_that_sticks_yields_sideways() -> None:

@@ -52,17 +52,17 @@ def compiled_filter(
         ),
         *(
             value.contiguous().numpy()
-            for value in _alike(conditions.normal, conditions.offset, conditions.friction)
+            for value in _alike(conditions.normal, conditions.offset_seen, conditions.friction)
         ),
         settings.substeps,
         settings.follow_path,
     )
     rows = (merged.poses, merged.variance, conditions.give.expand(-1, n + 1, -1), rest)
     seen = max(len(value) for value in rows)
-    poses, variance, shift, rest = (value.expand(seen, *value.shape[1:]) for value in rows)
+    poses, variance, give, rest = (value.expand(seen, *value.shape[1:]) for value in rows)
     values, slopes = field.basis(setting.angles)
     measured = Measured(
-        *(part.contiguous().numpy() for part in (poses, variance, shift, values, slopes, rest)),
+        *(part.contiguous().numpy() for part in (poses, variance, give, values, slopes, rest)),
         least.contiguous().numpy(),
         misfit_sd.contiguous().numpy(),
         setting.used.numpy(),

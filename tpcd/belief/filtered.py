@@ -83,13 +83,13 @@ def filter_history(
         transition = simulate_step(
             _column(scene, k + 1),
             merged.poses[:, k] - state.mean[:, count:] + begins,
-            _row(conditions.target, k + 1) + ends,
+            _row(conditions.target - conditions.carried, k + 1) + ends,
             _row(conditions.stiffness, k + 1),
             settings,
             previous=_row(conditions.target, k) + begins,
         )
-        pose = transition.pose - ends
-        residual = angle_difference(merged.poses[:, k + 1] - _row(conditions.give, k + 1), pose)
+        pose = transition.pose - ends + _row(conditions.give, k + 1)
+        residual = angle_difference(merged.poses[:, k + 1], pose)
         rows, uncovered = misfit_rows(field, sd, setting.angles[k], transition)
         usable = (transition.status <= int(StepStatus.RELAXED)) & finite
         usable = usable & torch.isfinite(residual).all(-1)

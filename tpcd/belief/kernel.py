@@ -37,15 +37,15 @@ class Measured(NamedTuple):
     """What is known and asked of m particles over n transitions between r = n + 1 rows.
 
     `poses` (c, r, 3) and their `variance`, the same for all particles (c = 1) or one for each;
-    `shift` (c, r, 3) is added to what the model predicts. Values and `slopes` (n, j) of the
-    bumps; `rest` (c, n) what the terms after each one can still add; `least` (m) what must be
-    reached; `sd` (m) of the misfit; `limit` of an innovation's square. `used` (n) says which
-    transitions count: the others part the history.
+    `give` (c, r, 3) is that of `Conditions`. Values and `slopes` (n, j) of the bumps; `rest` (c, n)
+    what the terms after each one can still add; `least` (m) what must be reached; `sd` (m) of the
+    misfit; `limit` of an innovation's square. `used` (n) says which transitions count: the others
+    part the history.
     """
 
     poses: np.ndarray
     variance: np.ndarray
-    shift: np.ndarray
+    give: np.ndarray
     bumps: np.ndarray
     slopes: np.ndarray
     rest: np.ndarray
@@ -155,6 +155,8 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                 starts[k, a] = measured.poses[seen, k, a]
                 previous[k, a] = given.commands[asked, k, a]
                 commands[k, a] = given.commands[asked, k + 1, a]
+                if math.isfinite(measured.give[seen, k + 1, a]):
+                    commands[k, a] -= measured.give[seen, k + 1, a]
             starts[k, 2] += begins
             previous[k, 2] += begins
             commands[k, 2] += ends
@@ -177,6 +179,8 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                 here, 0, chains, law, extent, request, k, answer, space, slopes, poses, by_theta, i
             )
             answer.poses[k, 2] -= ends
+            for a in range(3):
+                answer.poses[k, a] += measured.give[seen, k + 1, a]
             if answer.statuses[k] == JAMMED:
                 found.jammed[i] = True
                 break

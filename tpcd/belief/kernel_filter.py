@@ -86,9 +86,7 @@ def assimilate(state, measured, answer, seen, k, sd):
     size, variance = state.mean.shape[0] - 3, measured.variance
     total = 0.0
     for a in range(3):
-        innovation[a] = (
-            measured.poses[seen, k + 1, a] - measured.shift[seen, k + 1, a] - answer.poses[k, a]
-        )
+        innovation[a] = measured.poses[seen, k + 1, a] - answer.poses[k, a]
         total += innovation[a]
     if answer.statuses[k] > RELAXED or not math.isfinite(total):
         return -np.inf

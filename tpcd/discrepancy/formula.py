@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows, angle_difference
 from tpcd.effects.declare import DeclaredEffect, column
-from tpcd.effects.geometry import with_plane
+from tpcd.effects.geometry import sunk, with_plane
 from tpcd.effects.protocol import EffectParameter
 
 Covariate = Callable[[Outcome, Rows], Tensor]
@@ -74,7 +74,7 @@ def _stiffening(
     if outcome is None:
         return conditions
     sink = column(values, 0) * outcome.load[:, :, FLOOR].clamp_min(0.0).sqrt()
-    return with_plane(conditions, FLOOR, offset=conditions.offset[:, :, FLOOR] - sink)
+    return sunk(conditions, FLOOR, sink, rows, outcome)
 
 
 def _friction_formula(name: str, unit: str, most: float, covariate: Covariate) -> DeclaredEffect:

@@ -80,7 +80,8 @@ class Conditions:
     friction: Float[Tensor, "#m #r t"]
     """Coulomb coefficients."""
     give: Float[Tensor, "#m #r 3"]
-    """Added to the settled pose [m, m, rad]."""
+    """How far floor and wall are displaced on the way to the row, with what they hold [m, m, rad];
+    planes are not turned by its angle, which should stay 0."""
     sensor: Float[Tensor, "#m #r 3 3"]
     """Matrix by which the true wrench is read."""
     bias: Float[Tensor, "#m #r 3"]
@@ -91,12 +92,24 @@ class Conditions:
         """Command at which the arm, without other loads, feels the same contact."""
         return self.command + (self.load + self.pull) / self.stiffness
 
+    @property
+    def carried(self) -> Float[Tensor, "#m #r 3"]:
+        """`give`, zero where it is no number. A step is solved as seen from the ground: target and
+        planes are moved back by it, and the settled pose forward."""
+        return self.give.nan_to_num(0.0)
+
+    @property
+    def offset_seen(self) -> Float[Tensor, "#m #r t"]:
+        """Offsets of the planes as seen from ground that is carried [m]."""
+        return self.offset - (self.normal * self.carried[:, :, None, :2]).sum(-1)
+
     def scene(self, points_ee: Float[Tensor, "m 1 p 2"]) -> ContactScene:
         """Outlines and planes as a scene of batch (m, r), or (m, 1) where rows are alike."""
+        offset = self.offset_seen
         each = torch.broadcast_shapes(
-            self.normal.shape[:3], self.offset.shape, self.friction.shape, (len(points_ee), 1, 1)
+            self.normal.shape[:3], offset.shape, self.friction.shape, (len(points_ee), 1, 1)
         )
-        normals, offsets = self.normal.expand(*each, 2), self.offset.expand(each)
+        normals, offsets = self.normal.expand(*each, 2), offset.expand(each)
         planes = zip(normals.unbind(2), offsets.unbind(2), strict=True)
         return ContactScene(
             points_ee, tuple(HalfPlane(*plane) for plane in planes), self.friction.expand(each)

@@ -1,7 +1,8 @@
 """Effects on the contact law: compliance, adhesion, and what friction depends on.
 
 Compliances c are far stiffer than the arm's impedance K, so that the load under which a surface
-yields is found in few passes: the error of each is c K times that of the one before.
+yields is found in few passes: the error of each is c K times that of the one before. A surface that
+yields carries along what it holds (`Conditions.give`), or a grip would be lost as the load changes.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from tpcd.effects.conditions import FLOOR, WALL, Conditions, Outcome, Rows, angle_difference
 from tpcd.effects.declare import DeclaredEffect, column
-from tpcd.effects.geometry import with_plane
+from tpcd.effects.geometry import pose_change, sunk
 from tpcd.effects.protocol import EffectParameter
 from tpcd.simulator import ContactMode
 
@@ -29,7 +30,7 @@ def _compliance(terrain: int):
         if outcome is None:
             return conditions
         sink = column(values, 0) * outcome.load[:, :, terrain]
-        return with_plane(conditions, terrain, offset=conditions.offset[:, :, terrain] - sink)
+        return sunk(conditions, terrain, sink, rows, outcome)
 
     return change
 
@@ -39,16 +40,12 @@ def _tangential_compliance(
 ) -> Conditions:
     if outcome is None:
         return conditions
-    softness, give = column(values, 0), conditions.give
-    for terrain, axis in ((FLOOR, 0), (WALL, 1)):
-        drag = outcome.drag[:, :, terrain]
-        change = torch.where(
-            outcome.mode[:, :, terrain] == int(ContactMode.STICK), drag - rows.before(drag), 0.0
-        )
-        change = softness * change / (1.0 + softness * conditions.stiffness[..., axis])
-        normal = conditions.normal[:, :, terrain]
-        zero = torch.zeros_like(change)
-        give = give - torch.stack((change * normal[..., 1], -change * normal[..., 0], zero), dim=-1)
+    give = conditions.give
+    for terrain in (FLOOR, WALL):
+        drag, normal = outcome.drag[:, :, terrain], conditions.normal[:, :, terrain]
+        way = column(values, 0) * (rows.before(drag) - drag)
+        way = torch.where(outcome.load[:, :, terrain] > 0, way, 0.0)
+        give = give + pose_change(torch.stack((normal[..., 1], -normal[..., 0]), dim=-1), way)
     return replace(conditions, give=give)
 
 
@@ -149,7 +146,7 @@ CONTACT_EFFECTS = (
         _tangential_compliance,
         "contacts that stick yield sideways by {0}",
         needs=("floor stick",),
-        passes=1,
+        passes=2,
     ),
     DeclaredEffect(
         "adhesion",

@@ -29,6 +29,28 @@ def with_plane(
     return conditions
 
 
+def sunk(
+    conditions: Conditions, terrain: int, sink: Tensor, rows: Rows, outcome: Outcome
+) -> Conditions:
+    """The conditions with one terrain lower by `sink` (m, r) [m] under the loads of `outcome`.
+
+    It carries along what it holds, unless that touches another terrain too and is carried by it.
+    """
+    alone = outcome.load[:, :, terrain] > 0
+    for other in range(outcome.load.shape[-1]):
+        if other != terrain:
+            alone = alone & ~(outcome.load[:, :, other] > 0)
+    way = torch.where(alone, rows.before(sink) - sink, 0.0)
+    give = conditions.give + pose_change(conditions.normal[:, :, terrain], way)
+    offset = conditions.offset[:, :, terrain] - sink
+    return with_plane(replace(conditions, give=give), terrain, offset=offset)
+
+
+def pose_change(direction: Tensor, way: Tensor) -> Tensor:
+    """A change of pose (m, r, 3) by a way (m, r) [m] along directions (m, r, 2)."""
+    return torch.cat((way[..., None] * direction, torch.zeros_like(way)[..., None]), dim=-1)
+
+
 def turned(normal: Tensor, angle: Tensor) -> Tensor:
     """Normals (m, r, 2) turned counter-clockwise by angles (m, r)."""
     x, z = normal[..., 0], normal[..., 1]

@@ -101,11 +101,10 @@ class RowByRow:
 
 def _read(transition: Transition, conditions: Conditions, index: Tensor) -> SimulatedRows:
     """What sensors read of the rows that settled."""
-    give = _at(conditions.give, index)
-    pose = transition.pose + give
+    pose = transition.pose
     offset = pose - _at(conditions.command, index)
     turn = torch.remainder(offset[..., 2:] + torch.pi, 2 * torch.pi) - torch.pi
-    offset = torch.where(give.new_tensor([False, False, True]).bool(), turn, offset)
+    offset = torch.cat((offset[..., :2], turn), dim=-1)
     true = _at(conditions.stiffness, index) * offset
     sensor = _at(conditions.sensor, index)
     read = (sensor @ true[..., None])[..., 0] + _at(conditions.bias, index)
@@ -113,7 +112,7 @@ def _read(transition: Transition, conditions: Conditions, index: Tensor) -> Simu
     shape = pose.shape[:2]
     return SimulatedRows(
         index,
-        replace(transition, pose=pose, wrench=true),
+        replace(transition, wrench=true),
         matrix.expand(*shape, 3, 3),
         read.expand(*shape, 3),
     )
@@ -127,15 +126,15 @@ def _settle(
         here = here.columns(index)
     before = rows.follows[index]
     target, turn = conditions.target, _pose(conditions.turn)
-    transition = simulate_step(
-        here,
+    starts, commands, previous = torch.broadcast_tensors(
         rows.starts[..., index, :] + _at(turn, before),
-        _at(target, index) + _at(turn, index),
-        _at(conditions.stiffness, index),
-        settings,
-        previous=_at(target, before) + _at(turn, before),
+        _at(target - conditions.carried, index) + _at(turn, index),
+        _at(target, before) + _at(turn, before),
     )
-    return replace(transition, pose=transition.pose - _at(turn, index))
+    stiffness = _at(conditions.stiffness, index)
+    transition = simulate_step(here, starts, commands, stiffness, settings, previous=previous)
+    moved = _at(conditions.give, index) - _at(turn, index)
+    return replace(transition, pose=transition.pose + moved)
 
 
 def _outcome(transition: Transition, rows: Rows, index: Tensor) -> Outcome:

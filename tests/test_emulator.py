@@ -45,13 +45,36 @@ def test_a_grip_is_a_spring_until_it_slips_and_then_friction() -> None:
     height = 0.03 - 2e-3
     load = world.wrench(np.array([0.0, height, 0.0]))[1]
     stuck = world.wrench(np.array([5e-4, height, 0.0]))
-    assert stuck[0] == pytest.approx(-5e-4 / COMPLIANCE)
+    spring = 1 / (COMPLIANCE - 1 / VERTEX_STIFFNESS + 1 / (2 * VERTEX_STIFFNESS))
+    assert stuck[0] == pytest.approx(-5e-4 * spring)
     for x in np.linspace(5e-4, 0.02, 50):
         slid = world.wrench(np.array([x, height, 0.0]))
     assert slid[0] == pytest.approx(-0.5 * load)
     # On the way back it sticks at once, at the edge of the cone on the other side at most.
     back = world.wrench(np.array([0.02 - 2e-4, height, 0.0]))
-    assert back[0] == pytest.approx(-0.5 * load + 2e-4 / COMPLIANCE)
+    assert back[0] == pytest.approx(-0.5 * load + 2e-4 * spring)
+
+
+def test_a_plate_stays_dragged_while_the_object_rolls_from_one_vertex_to_another() -> None:
+    world = square_world(friction=2.0)
+    turn, corner = 0.1, np.array([[-0.03, -0.03], [0.03, -0.03]])
+
+    def at(angle: float, along: float) -> np.ndarray:
+        """The square on its lower corner, which has moved by `along` from where it would be if
+        it had rolled to this angle."""
+        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        lowest = (corner @ rotation.T)[0 if angle > 0 else 1]
+        foot = corner[0 if angle > 0 else 1, 0] + along
+        return world.wrench(np.array([foot - lowest[0], -lowest[1] - 1e-3, angle]))
+
+    at(turn, 0.0)
+    for share in np.linspace(0.0, 1.0, 21):
+        dragged = at(turn, 4e-4 * share)
+    assert dragged[0] == pytest.approx(-4e-4 / COMPLIANCE)
+    # Over the flat face, where both corners hold, and on: the plate is where it was.
+    for angle in np.linspace(turn, -turn, 2001):
+        rolled = at(angle, 4e-4)
+    assert rolled[0] == pytest.approx(dragged[0], rel=0.03)
 
 
 def test_the_wall_pushes_left_and_its_torque_is_force_times_lever() -> None:

@@ -29,6 +29,8 @@ def press(
     start_z: float = 0.01,
     seconds: float = 40.0,
     noise: float = 0.2,
+    delay: int = DELAY,
+    every: int = 25,
 ) -> tuple[float | None, np.ndarray, bool]:
     """Press on a spring [N/m] at z = 0 through a delayed servo; when it settled, forces, and
     whether the detector called it unstable."""
@@ -36,7 +38,7 @@ def press(
     window = Window(SettlingSettings(), np.array([noise, noise, 0.01]))
     state = at_rest(np.array([0.0, start_z, 0.0]), np.zeros(3))
     command = np.array([0.0, command_z, 0.0])
-    queue = [start_z] * DELAY
+    queue = [start_z] * delay
     forces = []
     for count in range(int(seconds / STEP)):
         z = queue.pop(0)
@@ -47,7 +49,7 @@ def press(
         queue.append(float(state.reference[1]))
         pose = np.array([state.reference[0], z, state.reference[2]])
         window.add(count * STEP, pose, measured, residual(settings, state, command))
-        if count % 25 == 0:
+        if count % every == 0:
             if window.still() is not None:
                 return count * STEP, np.array(forces), False
             if window.unstable():
@@ -75,6 +77,46 @@ def test_too_little_damping_is_unstable_and_detected(surface: float) -> None:
     settings = settings_for_surface(STIFFNESS, surface, damping_time=0.006, free_time=0.012)
     _, forces, unstable = press(settings, surface, -0.04)
     assert unstable and len(forces) * STEP < 3.0
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+@pytest.mark.parametrize("frequency", [5.0, 8.0])
+def test_what_rings_after_a_touch_is_unstable_only_where_it_does_not_die_out(
+    lasts: bool, frequency: float
+) -> None:
+    """Growing for 0.4 s to 5 N and then shrinking or not."""
+    window = Window(SettlingSettings(), np.array([0.2, 0.2, 0.01]))
+    found = []
+    for count in range(round(4 / STEP)):
+        time = max(0.0, count * STEP - 1.0)
+        share = time / 0.4
+        size = 1.0 if lasts and share > 1 else share * math.exp(1 - share)
+        force = 3.0 + 5.0 * size * math.sin(2 * math.pi * frequency * time)
+        window.add(count * STEP, np.zeros(3), np.array([0.0, force, 0.0]), np.zeros(3))
+        if count % 12 == 0:
+            found.append(window.unstable())
+    assert any(found) == lasts
+
+
+@pytest.mark.parametrize("depth", [-0.02, -0.03])
+def test_a_surface_five_times_as_stiff_as_stated_is_found_out_while_it_bounces(
+    depth: float,
+) -> None:
+    """A limit cycle of 4 to 5 Hz between touching and not, and a servo of 48 ms."""
+    law = settings_for_surface(STIFFNESS, 5e3)
+    _, forces, unstable = press(law, 2.5e4, depth, seconds=8.0, delay=24, every=12)
+    assert unstable and len(forces) * STEP < 4.0
+
+
+def test_nothing_is_still_while_it_oscillates() -> None:
+    """Means over half a window hide 10 Hz: three whole periods."""
+    window = Window(SettlingSettings(), np.array([0.2, 0.2, 0.01]))
+    for count in range(round(2.5 / STEP)):
+        force = 3.0 + 2.5 * math.sin(2 * math.pi * 10 * count * STEP)
+        window.add(count * STEP, np.zeros(3), np.array([0.0, force, 0.0]), np.zeros(3))
+        if count % 12 == 0:
+            window.unstable()
+            assert window.still() is None
 
 
 @pytest.mark.parametrize("command_z", [-0.002, -0.005, -0.008])

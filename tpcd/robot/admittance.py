@@ -36,9 +36,12 @@ SURFACES = 2
 """Surfaces that may be met at once."""
 REACTION_TIME = 0.05
 """From touching to the arm being slowed down: servo, filter and sampling [s]."""
-LEVER = 0.2
+LEVER = 0.25
 """Damping of the angle is that of a surface point so far from the end effector [m]. Larger than a
 hand-held object, since flat faces are stiffer against turning than single points."""
+LEVER_STIFFNESS = 3.2e4
+"""Of a surface, beyond which the angle is damped no more [N/m]: how far a flat face yields when it
+is turned is a matter of the face, not of the bed below (emulated, 0.2 mm per 10 N)."""
 WAY = 0.0015
 """A way on which the wrench has not changed is soft after so much of it [m]. With `SLIGHT`, another
 direction is off it by 0.04 rad at most on a surface of 5 kN/m (emulated slides, 0.2 to 3 mm)."""
@@ -100,7 +103,8 @@ def settings_for_surface(
     if not surface_stiffness > 0:
         raise ValueError(f"surface_stiffness is {surface_stiffness}, expected N/m above 0")
     linear = damping_time * SURFACES * surface_stiffness
-    damping = np.array([linear, linear, linear * LEVER**2])
+    turning = linear * min(1.0, LEVER_STIFFNESS / surface_stiffness)
+    damping = np.array([linear, linear, turning * LEVER**2])
     free = np.minimum(damping, free_time * np.array(stiffness))
     speed = min(largest_speed, impact_force / (surface_stiffness * REACTION_TIME))
     return AdmittanceSettings(

@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,10 @@ class SettlingSettings:
     """Standard deviations of a difference of means that noise may account for."""
     oscillation: float = 1.0
     """Oscillation of a force, as standard deviation, that is not noise [N]; of a torque a tenth."""
+    lasting: float = 1.0
+    """Time for which it must not die out [s]."""
+    dying: float = 0.7
+    """An oscillation that has come down to this share of its largest is dying out."""
     crossings: int = 6
     """Changes of sign in a window that make an oscillation."""
 
@@ -62,6 +66,8 @@ class Window:
         self._rows: deque[np.ndarray] = deque()
         self._rested: float | None = None
         """Stamp of the end of that first window."""
+        self._ringing: tuple[float, np.ndarray] | None = None
+        """Since when the wrench oscillates, and how much at most; 0 for an axis that does not."""
 
     def add(
         self,
@@ -84,7 +90,7 @@ class Window:
     def still(self) -> Still | None:
         """The means of the window after the first one in which pose and force were steady and
         nothing was left to move them; what still comes nearer then is off to the same side."""
-        if not self.full:
+        if not self.full or self._ringing is not None:
             return None
         rows, settings = np.array(self._rows), self.settings
         now = float(rows[-1, 0])
@@ -115,9 +121,29 @@ class Window:
         return Still(mean[1:4], mean[4:7], float(rows[0, 0]), float(rows[-1, 0]), len(rows))
 
     def unstable(self) -> bool:
-        """Whether the wrench oscillates and does not die out."""
+        """Whether the wrench has oscillated for `lasting` without dying out: what rings after
+        a touch shrinks meanwhile. To be asked all along, as often as is wanted."""
         if not self.full:
             return False
+        now = float(self._rows[-1][0])
+        size, large, swings = self._swing()
+        if self._ringing is not None:
+            since, largest = self._ringing
+            largest = np.where(largest > 0, np.maximum(largest, size), 0.0)
+            self._ringing = since, largest
+            if not (large & (size > self.settings.dying * largest) & (largest > 0)).any():
+                self._ringing = None
+            elif now - since > self.settings.lasting:
+                return True
+        if self._ringing is None and swings.any():
+            self._ringing = now, np.where(swings, size, 0.0)
+        return False
+
+    def _swing(
+        self,
+    ) -> tuple[Float[np.ndarray, " 3"], Bool[np.ndarray, " 3"], Bool[np.ndarray, " 3"]]:
+        """Of each axis of the wrench the standard deviation about a line in the window's second
+        half, whether it is more than noise, and whether it is an oscillation that lasts."""
         rows, settings = np.array(self._rows), self.settings
         stamps, wrench = rows[:, 0] - rows[0, 0], rows[:, 4:7]
         line = np.polynomial.polynomial.polyfit(stamps, wrench, 1)
@@ -129,7 +155,7 @@ class Window:
         # Noise on a slow swing crosses zero often too; it must have got clearly past it.
         outside = np.where(np.abs(swing) > 0.5 * swing.std(0), np.sign(swing), 0.0)
         crossings = np.array([_sign_changes(column) for column in outside.T])
-        return bool((large & (after > 0.8 * before) & (crossings >= settings.crossings)).any())
+        return after, large, large & (after > 0.8 * before) & (crossings >= settings.crossings)
 
 
 def _sign_changes(signs: np.ndarray) -> int:

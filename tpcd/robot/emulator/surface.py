@@ -1,8 +1,9 @@
 """A world that yields: an outline pushed by a position-controlled hand into floor and wall.
 
-Floor and wall are rigid plates on springs; the outline's hull vertices press into them with a
-stiffness of their own, and hold by Coulomb friction through springs along the plate which let go at
-friction times load. Quasi-static: forces follow from the pose and from where each vertex stuck.
+Floor and wall are rigid plates on springs, which give way across and along; the outline's hull
+vertices press into them with a stiffness of their own, and hold by Coulomb friction through as
+stiff springs which let go at friction times load. Quasi-static: forces follow from the pose and
+from where each vertex stuck.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Float
 
 from tpcd.truth.hull import hull_vertices
 
-VERTEX_STIFFNESS = 5e4
+VERTEX_STIFFNESS = 2e5
 """Of a single vertex against the plate [N/m]; part of the yield of the whole."""
 
 
@@ -24,10 +25,10 @@ class Plate:
     def __init__(self, compliance: float, friction: float, count: int) -> None:
         """`compliance` [m/N] is the yield of plate and vertex together, along it and across."""
         total = max(compliance, 1.05 / VERTEX_STIFFNESS)
-        self._plate_compliance = total - 1.0 / VERTEX_STIFFNESS
-        self._stiffness_along = 1.0 / total
+        self._compliance = total - 1.0 / VERTEX_STIFFNESS
         self._friction = friction
-        self._anchors = np.full(count, np.nan)
+        self._moved = 0.0
+        self._anchors = np.full(count, np.nan)  # on the plate
 
     def press(
         self, along: Float[np.ndarray, " p"], height: Float[np.ndarray, " p"]
@@ -35,37 +36,43 @@ class Plate:
         """Forces on the points along and across [N], and keep where they stick."""
         tangential, normal = np.zeros_like(along), np.zeros_like(along)
         touching = np.flatnonzero(height < 0)
-        if not len(touching):
-            self._anchors[:] = np.nan
-            return tangential, normal
-        depths = -height[touching]
-        sunk = self._plate_compliance * self._load(depths)
-        pressed = VERTEX_STIFFNESS * np.maximum(0.0, depths - sunk)
-        normal[touching] = pressed
-        total = float(pressed.sum())
+        if len(touching):
+            depths = -height[touching]
+            sunk = self._compliance * self._load(depths)
+            normal[touching] = VERTEX_STIFFNESS * np.maximum(0.0, depths - sunk)
         held = normal > 0
-        self._anchors[~held] = np.nan
         fresh = held & np.isnan(self._anchors)
-        self._anchors[fresh] = along[fresh]
-        if total <= 0 or self._friction == 0:
-            return tangential, normal
-        # Each vertex has its share of the plate's stiffness, so that all together have it once.
-        spring = self._stiffness_along * normal[held] / total
-        wanted = spring * (self._anchors[held] - along[held])
-        most = self._friction * normal[held]
-        force = np.clip(wanted, -most, most)
-        self._anchors[held] = along[held] + force / spring
-        tangential[held] = force
+        self._anchors[~held] = np.nan
+        self._anchors[fresh] = along[fresh] - self._moved
+        self._moved = 0.0
+        if held.any():
+            most = self._friction * normal[held] / VERTEX_STIFFNESS
+            stretch = self._anchors[held] - along[held]
+            self._moved = self._dragged(stretch, most)
+            held_back = np.clip(stretch + self._moved, -most, most)
+            self._anchors[held] = along[held] - self._moved + held_back
+            tangential[held] = VERTEX_STIFFNESS * held_back
         return tangential, normal
+
+    def _dragged(self, stretch: Float[np.ndarray, " c"], most: Float[np.ndarray, " c"]) -> float:
+        """How far along itself the plate is dragged until its spring holds the vertices' [m]."""
+        share = VERTEX_STIFFNESS * self._compliance
+        # What is out of balance grows with the plate's way, in straight pieces from bend to bend.
+        bends = np.sort(np.concatenate((-stretch - most, -stretch + most)))
+        springs = np.clip(stretch + bends[:, None], -most, most)
+        off = bends + share * springs.sum(axis=1)
+        if off[0] > 0 or off[-1] < 0:  # all vertices slip
+            return float(bends[0] - off[0] if off[0] > 0 else bends[-1] - off[-1])
+        return float(np.interp(0.0, off, bends))
 
     def _load(self, depths: Float[np.ndarray, " c"]) -> float:
         """Total force at which plate and vertices are in equilibrium: piecewise linear."""
         total, force = 0.0, 0.0
         for count, depth in enumerate(sorted(depths.tolist(), reverse=True), start=1):
-            if depth <= self._plate_compliance * force:
+            if depth <= self._compliance * force:
                 break
             total += depth
-            share = VERTEX_STIFFNESS * self._plate_compliance
+            share = VERTEX_STIFFNESS * self._compliance
             force = VERTEX_STIFFNESS * total / (1.0 + count * share)
         return force
 

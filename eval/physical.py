@@ -116,7 +116,7 @@ def _rows(
     ]
     model, found = _found(config, recorded, folder)
     if model is not None and model.effects:
-        settings = EstimatorSettings(step=model.step, effects=model.effects)
+        settings = EstimatorSettings(step=model.step, effects=model.informed)
         added = estimate(expert, load_prior(config.prior), stream(config.seed, 8), settings)
         row = _row(name, tiles, "ours, gap found", list(added)[-1].belief, test)
         rows.append({**row, "found": found})

@@ -89,7 +89,7 @@ def estimate_episode(config: Estimate) -> None:
                 sampler=SamplerSettings(particles=config.particles),
                 step=model.step,
                 misfit_sd=config.misfit,
-                effects=model.effects,
+                effects=model.informed,
             )
             steps = estimate(episode, shape, generator, settings, state)
         belief = run_estimation(steps, episode, config.prior, folder, done=done)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from command_calls import call, make_world
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
@@ -104,6 +104,24 @@ def test_values_known_for_certain_are_taken_within_the_prior(learnt, mean: float
     assert (drawn == expected).all()
 
 
+@pytest.mark.parametrize(
+    ("mean", "std", "low", "high"),
+    [
+        (3e-4, 2e-5, 2.2e-4, 3.8e-4),
+        (3e-5, 2e-5, 0.0, 1.1e-4),  # the range of the prior holds
+        (3e-4, 0.0, 2.992e-4, 3.008e-4),  # known exactly
+        (9e-4, 1e-5, 7.6e-4, 8e-4),  # found beyond the range
+    ],
+)
+def test_an_estimate_from_other_data_starts_at_what_was_found(
+    mean: float, std: float, low: float, high: float
+) -> None:
+    (effect,) = soft(mean, std).informed
+    (parameter,) = effect.parameters
+    assert (parameter.low, parameter.high) == pytest.approx((low, high))
+    assert Model((SOFT, BIAS)).informed == (SOFT, BIAS)
+
+
 def test_without_anything_found_draws_are_of_the_prior(learnt) -> None:
     belief, _ = learnt
     joined = with_model(belief, Model((BIAS,)), torch.Generator().manual_seed(2))
@@ -175,12 +193,18 @@ def test_predict_takes_a_model(world: Path, tmp_path: Path, capsys) -> None:
     assert min(b - a for a, b in zip(*heights, strict=True)) < -1e-4
 
 
-def test_predict_refuses_effects_that_the_belief_has(world: Path, tmp_path: Path, capsys) -> None:
-    path = tmp_path / "model.yaml"
-    path.write_text(yaml.safe_dump({"effects": [{"name": "floor_compliance"}]}))
+def test_estimate_takes_what_was_found_and_predict_then_needs_no_model(
+    world: Path, tmp_path: Path, capsys
+) -> None:
+    """The floor of these data is rigid: a prior of all compliances would be near 0."""
+    path = write_model(soft(2e-4, 1e-5), tmp_path / "model.yaml")
     episode, out = str(world / "explore.csv"), tmp_path / "run"
     arguments = ("--prior", "ycb21-z2", "--particles", "32", "--out", str(out))
     assert call("estimate", episode, *arguments, "--model", str(path)) == 0
+    (kept,) = load_model(out / "model.yaml").effects
+    assert (kept.parameters[0].low, kept.parameters[0].high) == pytest.approx((1.6e-4, 2.4e-4))
+    parameters = json.loads((out / "summary.json").read_text())["parameters"]
+    assert 1.6e-4 < parameters["floor_compliance.compliance"]["mean"] < 2.4e-4
     capsys.readouterr()
     given = (str(out), str(world / "test.csv"), "--out", str(tmp_path / "p.csv"))
     assert call("predict", *given, "--model", str(path)) != 0

@@ -84,7 +84,7 @@ def explore_in_folder(
         if done >= options.steps and (folder / RESULTS_FILE).is_file():
             raise ValueError(f"{options.out} has all of its {options.steps} moves; raise --steps")
         on_stage = stage(folder, limits, task)
-        settings = EstimatorSettings(step=model.step, effects=model.effects)
+        settings = EstimatorSettings(step=model.step, effects=model.informed)
         steps = explore(
             on_stage.robot,
             on_stage.policy,

@@ -41,5 +41,5 @@ def keep_model(model: Model, folder: Path, given: Path | None) -> None:
 
 
 def _plain(model: Model) -> dict[str, Any]:
-    effects = effects_to_plain(model.effects, fingerprints=True)
+    effects = effects_to_plain(model.informed, fingerprints=True)
     return {"effects": effects, "step": asdict(model.step)}

@@ -6,7 +6,7 @@ A YAML file:
       - name: floor_compliance           # from the catalogue
         parameters:                      # optional: narrower priors, SI units
           compliance: [1.0e-4, 4.0e-4]
-        found:                           # optional: mean and standard deviation, for predict
+        found:                           # optional: mean and standard deviation
           compliance: [2.1e-4, 1.6e-5]
       - name: magnet                     # an effect of your own
         file: my_effects.py              # relative to this file; holds EFFECTS = (...)
@@ -31,12 +31,15 @@ import yaml
 
 from tpcd.effects.catalogue import CATALOGUE, find_effect
 from tpcd.effects.check import check_effect
+from tpcd.effects.declare import DeclaredEffect
 from tpcd.effects.protocol import SITES, Effect, EffectParameter, effect_to_plain
 from tpcd.errors import EffectError, ModelError
 from tpcd.simulator.record import StepSettings
 
 Found = Mapping[str, Mapping[str, tuple[float, float]]]
 """Mean and standard deviation [SI units] that data gave parameters of effects, by both names."""
+REACH = 4.0
+"""Standard deviations about what was found that a prior keeps."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,17 @@ class Model:
     effects: tuple[Effect, ...] = ()
     step: StepSettings = StepSettings()
     found: Found = field(default_factory=dict)
+
+    @property
+    def informed(self) -> tuple[Effect, ...]:
+        """The effects for an estimate from other data: priors narrowed to what was found, within
+        `REACH` standard deviations and the range they have. Effects of a user's own class stay."""
+        return tuple(
+            _with_priors(effect, _narrowed(effect, self.found.get(effect.name, {})))
+            if isinstance(effect, DeclaredEffect)
+            else effect
+            for effect in self.effects
+        )
 
 
 def load_model(path: str | Path) -> Model:
@@ -210,6 +224,21 @@ def _with_priors(effect: Effect, given: Any) -> Effect:
             ) from None
         parameters.append(replace(parameter, low=low, high=high))
     return replace(effect, parameters=tuple(parameters))  # type: ignore[type-var]
+
+
+def _narrowed(
+    effect: Effect, found: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Ranges about what was found; where that lies beyond the range of a prior, at its end."""
+    ranges = {}
+    for parameter in effect.parameters:
+        if parameter.name in found:
+            mean, std = found[parameter.name]
+            reach = max(REACH * std, 1e-3 * (parameter.high - parameter.low))
+            middle = min(max(mean, parameter.low), parameter.high)
+            ends = middle - reach, middle + reach
+            ranges[parameter.name] = max(ends[0], parameter.low), min(ends[1], parameter.high)
+    return ranges
 
 
 def _found_of(plain: Any, effects: Sequence[Effect], path: Path) -> Found:

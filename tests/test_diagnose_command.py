@@ -114,6 +114,21 @@ def test_a_stopped_run_keeps_its_fits_and_goes_on(
     assert "has its verdict" in capsys.readouterr().err
 
 
+def test_what_was_added_later_is_shown_as_it_was_then() -> None:
+    from tpcd.commands.diagnosing import shown_candidates
+
+    candidates = (
+        Candidate("finer_steps", 0, 40.0),
+        Candidate("floor_compliance", 1, 119.0, (), "accepted: gain 119.0"),
+        Candidate("wall_compliance", 1, 28.6),
+        Candidate("grasp_slip", 1, float("nan"), (), "not excited: places"),
+        Candidate("wall_compliance", 2, 31.5, (), "accepted: gain 31.5"),
+        Candidate("floor_tilt", 2, 9.0, (), "rejected: gain 9.0"),
+    )
+    shown = shown_candidates(replace(a_diagnosis(), candidates=candidates))
+    assert [(c.name, c.round) for c in shown] == [("floor_compliance", 1), ("wall_compliance", 2)]
+
+
 def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:
     from torch.utils.tensorboard import SummaryWriter
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.diagnosis import Cell, Diagnosis
+from tpcd.discrepancy.diagnosis import Candidate, Cell, Diagnosis
 from tpcd.discrepancy.memory import Memory, digest
 from tpcd.effects.model import Model, write_model
 from tpcd.errors import RunError
@@ -151,16 +151,16 @@ def draw_diagnosis(
             "What the models leave, by contact mode (number of transitions) and channel: the"
             " largest score of residuals' mean, size, or slope with load, place, angle or time.",
         )
-    tried = [c for c in diagnosis.candidates if math.isfinite(c.gain) and c.round == 1]
+    tried = shown_candidates(diagnosis)
     if tried:
         drawn["evidence"] = (
             evidence_bars(
-                [c.name for c in tried],
+                [f"{c.name}, round {c.round}" if c.round > 1 else c.name for c in tried],
                 [c.gain for c in tried],
                 [c.name in diagnosis.names for c in tried],
                 least_gain,
             ),
-            "Candidates of the first round.",
+            "Candidates of the first round, and what later rounds added.",
         )
     if diagnosis.gap:
         columns = zip(
@@ -201,6 +201,16 @@ def render_page(
         episodes=[str(path) for path in paths if path is not None],
         finite=math.isfinite,
     )
+
+
+def shown_candidates(diagnosis: Diagnosis) -> list[Candidate]:
+    """Those of the first round; what a later round added as it was then, over the model before."""
+    shown: dict[str, Candidate] = {}
+    for candidate in sorted(diagnosis.candidates, key=lambda c: c.round):
+        added = candidate.round > 1 and candidate.outcome.startswith("accepted")
+        if math.isfinite(candidate.gain) and (candidate.round == 1 or added):
+            shown[candidate.name] = candidate
+    return list(shown.values())
 
 
 def _largest_scores(cells: Sequence[Cell]) -> list[tuple[str, str, float]]:

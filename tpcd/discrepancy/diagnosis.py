@@ -50,7 +50,6 @@ class Candidate:
 
     name: str
     round: int
-    """From 1; 0 for other base models."""
     """From 1; 0 for another base model."""
     gain: float
     """Log evidence minus that of the model of the round before."""

@@ -68,7 +68,7 @@ def test_settled_poses_move_with_theta_as_automatic_derivatives_say(
             readings=history.readings[k : k + 2],
             merged=Merged(**{**merged, "variance": unit**2 * known[None]}),
         )
-        found = linearised_likelihood(
+        found, _ = linearised_likelihood(
             prior.shape, vectors, slopes, torch.zeros(8).double(), one, MisfitField(0.0), settings
         )
         theta = vectors.clone().requires_grad_()

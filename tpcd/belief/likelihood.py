@@ -47,8 +47,12 @@ def history_likelihood(
     least: Float[Tensor, " m"] | None = None,
     innovations: bool = False,
     added: Added | None = None,
+    outcome: Outcome | None = None,
 ) -> HistoryLikelihood:
-    """Evaluate m particles, each with its own size of the outline misfit, on n transitions."""
+    """Evaluate m particles, each with its own size of the outline misfit, on n transitions.
+
+    Effects answer to the `outcome` if one is given: not quite theirs, but at the cost of one pass.
+    """
     if least is not None and not innovations:
         hopeless = least == torch.inf
         if bool(hopeless.any()):
@@ -71,7 +75,7 @@ def history_likelihood(
     setting = history.setting(scene)
     relative = None
     if added is not None and added.effects:
-        setting = effective_setting(scene, history, misfit_sd, field, settings, added)
+        setting, _ = effective_setting(scene, history, misfit_sd, field, settings, added, outcome)
         read = history.read
         relative = setting.merged.log_parity(read) - history.merged.log_parity(read)
         least = None if least is None else least - relative
@@ -90,29 +94,31 @@ def effective_setting(
     field: MisfitField,
     settings: StepSettings,
     added: Added,
-) -> Setting:
-    """The history under the effects of each particle."""
+    outcome: Outcome | None = None,
+) -> tuple[Setting, Outcome | None]:
+    """The history under the effects of each particle, and the outcome that they answer to: the
+    one that is given, or else that of as many passes as they need."""
     base = history.setting(scene)
-    rows = history.rows
-
-    def after(outcome: Outcome | None) -> Setting:
-        conditions = added.apply(base.conditions, rows, outcome)
-        merged = merge(history.readings, history.sensor_variance, conditions)
-        return replace(base, conditions=conditions, merged=merged)
-
-    setting = after(None)
-    for _ in range(added.passes):
+    passes = added.passes if outcome is None else 0
+    for k in range(passes):
+        setting = _answering(base, history, added, outcome)
         arguments = (scene.points_ee, setting, misfit_sd, field, settings)
         if misfit_sd.device.type == "cpu" and native.available():
             found = compiled_filter(*arguments, steps=True)
         else:
             found = filter_history(*arguments, steps=True)
         assert found.steps is not None
-        setting = after(outcome_of(found.steps, history))
-    return setting
+        outcome = outcome_of(found.steps, history, first=k == 0)
+    return _answering(base, history, added, outcome), outcome
 
 
-def outcome_of(steps: Steps, history: History) -> Outcome:
+def _answering(base: Setting, history: History, added: Added, outcome: Outcome | None) -> Setting:
+    conditions = added.apply(base.conditions, history.rows, outcome)
+    merged = merge(history.readings, history.sensor_variance, conditions)
+    return replace(base, conditions=conditions, merged=merged)
+
+
+def outcome_of(steps: Steps, history: History, first: bool = False) -> Outcome:
     """The settled rows: those of the transitions, and readings where none leads to a row."""
     m = len(steps.pose)
     pose = history.readings[:, :3].expand(m, -1, -1).clone()
@@ -122,7 +128,8 @@ def outcome_of(steps: Steps, history: History) -> Outcome:
         torch.cat((torch.zeros_like(value[:, :1]), value), dim=1)
         for value in (steps.mode, steps.contacts.nan_to_num(0.0))
     )
-    return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:])
+    whether = torch.full(pose.shape[:2], first, device=pose.device)
+    return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:], whether)
 
 
 def highest_terms(history: History) -> Float[Tensor, " n"]:

@@ -13,6 +13,7 @@ from tpcd.belief.history import History
 from tpcd.belief.likelihood import effective_setting
 from tpcd.belief.misfit import MisfitField
 from tpcd.contact import place_points, scene_from_parameters
+from tpcd.effects.conditions import Outcome
 from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
@@ -31,8 +32,9 @@ def linearised_likelihood(
     field: MisfitField,
     settings: StepSettings,
     added: Added | None = None,
-) -> HistoryLikelihood:
-    """The likelihood with the derivatives of its innovations by d coordinates, in compiled loops.
+) -> tuple[HistoryLikelihood, Outcome | None]:
+    """The likelihood with the derivatives of its innovations by d coordinates, in compiled loops,
+    and the outcome that effects answer to.
 
     `vectors` are theta, and `slopes` the derivatives of each entry by its own coordinate. The
     scene moves by differences, the settled poses by the derivatives of the rest equations,
@@ -60,10 +62,10 @@ def linearised_likelihood(
         parts.append(np.ascontiguousarray((value[1:] - value[0]).swapaxes(0, 1)) / _DIFFERENCE)
     first = Parameters.from_vector(vectors)
     scene = scene_from_parameters(shape, first, place_points(points[0], first.scale, first.mount))
-    setting = history.setting(scene)
+    setting, outcome = history.setting(scene), None
     if added is not None and added.effects:
-        setting = effective_setting(scene, history, misfit_sd, field, settings, added)
-    return compiled_filter(
+        setting, outcome = effective_setting(scene, history, misfit_sd, field, settings, added)
+    found = compiled_filter(
         scene.points_ee,
         setting,
         misfit_sd,
@@ -72,3 +74,4 @@ def linearised_likelihood(
         innovations=True,
         by_theta=SceneSlopes(*parts),
     )
+    return found, outcome

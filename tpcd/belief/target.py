@@ -16,6 +16,7 @@ from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.setting import merge
+from tpcd.effects.conditions import Outcome
 from tpcd.simulator import StepSettings, native
 
 _LARGE_MISFIT = 2.0
@@ -100,7 +101,7 @@ class ContactTarget:
         assert self.history is not None
         vectors, slope = self.prior.to_vector_with_slope(score[:, :-1])
         scene, added = self.prior.scene_dimension, self.prior.added_of(vectors)
-        here = linearised_likelihood(
+        here, outcome = linearised_likelihood(
             self.prior.shape,
             vectors[:, :scene],
             slope[:, :scene],
@@ -114,11 +115,12 @@ class ContactTarget:
         whitened = torch.cat((_known(here.whitened), parity), dim=1)
         log_scale = torch.cat((_known(here.log_scale), parity_scale), dim=1)
         slopes, stretch = [_known(here.slopes)], []
-        # Effects and the size of the misfit by differences.
+        # Effects and the size of the misfit by differences; what the answer of effects to a change
+        # of contact forces adds to them is left out.
         for entry in range(scene, s):
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE
-            there = self.evaluate(moved, innovations=True)
+            there = self.evaluate(moved, innovations=True, outcome=outcome)
             parity, parity_scale = self.parity(moved)
             found = torch.cat((_known(there.whitened), parity), dim=1)
             scale = torch.cat((_known(there.log_scale), parity_scale), dim=1)
@@ -148,8 +150,9 @@ class ContactTarget:
         score: Float[Tensor, "m s"],
         least: Float[Tensor, " m"] | None = None,
         innovations: bool = False,
+        outcome: Outcome | None = None,
     ) -> HistoryLikelihood:
-        """What the particles say about the history."""
+        """What the particles say about the history; effects answer to the `outcome` if given."""
         assert self.history is not None
         vectors = self.prior.to_vector(score[:, :-1])
         return history_likelihood(
@@ -162,6 +165,7 @@ class ContactTarget:
             least,
             innovations,
             self.prior.added_of(vectors),
+            outcome,
         )
 
 

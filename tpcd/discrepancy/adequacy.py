@@ -123,7 +123,7 @@ def innovations(
     sd = question.misfit.sd_of(positions[:, -1])
     scene = scene_from_parameters(prior.shape, prior.parameters_of(vectors))
     added = prior.added_of(vectors)
-    setting = effective_setting(scene, history, sd, question.misfit, fit.step, added)
+    setting, _ = effective_setting(scene, history, sd, question.misfit, fit.step, added)
     run = compiled_filter if native.available() else filter_history
     found = run(
         scene.points_ee, setting, sd, question.misfit, fit.step, innovations=True, steps=True

@@ -73,7 +73,11 @@ def _stiffening(
 ) -> Conditions:
     if outcome is None:
         return conditions
-    sink = column(values, 0) * outcome.load[:, :, FLOOR].clamp_min(0.0).sqrt()
+    slope, load = column(values, 0), outcome.load[:, :, FLOOR].clamp_min(0.0)
+    # sink = slope * root of load, and on rigid ground the load was more by stiffness * sink.
+    less = slope * conditions.stiffness_along(conditions.normal[:, :, FLOOR])
+    less = torch.where(outcome.first, less, 0.0)
+    sink = 2 * slope * load / (less + (less**2 + 4 * load).sqrt()).clamp_min(1e-12)
     return sunk(conditions, FLOOR, sink, rows, outcome)
 
 
@@ -114,7 +118,7 @@ FORMULAS = (
         _stiffening,
         "the floor yields by {0} times the root of the load",
         needs=("floor loads",),
-        passes=2,
+        passes=1,
     ),
 )
 """Formulas that are tried, in no order."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.contact import ContactScene
@@ -52,6 +52,8 @@ class Outcome:
     """Tangential force of each terrain on the object, along the terrain's tangent [N]."""
     arm: Float[Tensor, "m r t 2"]
     """From the end effector to the contact point, in world axes [m]."""
+    first: Bool[Tensor, "m r"]
+    """Whether no effect had answered to an outcome yet: of the first pass."""
 
     @property
     def place(self) -> Float[Tensor, "m r t 2"]:
@@ -91,6 +93,10 @@ class Conditions:
     def target(self) -> Float[Tensor, "#m #r 3"]:
         """Command at which the arm, without other loads, feels the same contact."""
         return self.command + (self.load + self.pull) / self.stiffness
+
+    def stiffness_along(self, direction: Float[Tensor, "m r 2"]) -> Float[Tensor, "m r"]:
+        """Of the arm, along unit vectors [N/m]."""
+        return (direction**2 * self.stiffness[..., :2]).sum(-1)
 
     @property
     def carried(self) -> Float[Tensor, "#m #r 3"]:

@@ -1,8 +1,10 @@
 """Effects on the contact law: compliance, adhesion, and what friction depends on.
 
-Compliances c are far stiffer than the arm's impedance K, so that the load under which a surface
-yields is found in few passes: the error of each is c K times that of the one before. A surface that
-yields carries along what it holds (`Conditions.give`), or a grip would be lost as the load changes.
+Under the load N that it has on rigid ground a surface would yield by c N, but as it does the arm's
+spring K eases, so that c N / (1 + c K) is where it ends. That is taken from the first pass; an
+error in a later one falls to c K times that of the one before. A surface that yields carries along
+what it holds (`Conditions.give`), or a grip would be lost as the load changes. Where both surfaces
+hold the object, rigid friction leaves open how they share its load: passes need not converge.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ def _compliance(terrain: int):
     ) -> Conditions:
         if outcome is None:
             return conditions
-        sink = column(values, 0) * outcome.load[:, :, terrain]
+        softness = column(values, 0)
+        rigid = 1.0 + softness * conditions.stiffness_along(conditions.normal[:, :, terrain])
+        sink = softness * outcome.load[:, :, terrain] / torch.where(outcome.first, rigid, 1.0)
         return sunk(conditions, terrain, sink, rows, outcome)
 
     return change
@@ -40,12 +44,19 @@ def _tangential_compliance(
 ) -> Conditions:
     if outcome is None:
         return conditions
-    give = conditions.give
+    give, softness = conditions.give, column(values, 0)
     for terrain in (FLOOR, WALL):
-        drag, normal = outcome.drag[:, :, terrain], conditions.normal[:, :, terrain]
-        way = column(values, 0) * (rows.before(drag) - drag)
-        way = torch.where(outcome.load[:, :, terrain] > 0, way, 0.0)
-        give = give + pose_change(torch.stack((normal[..., 1], -normal[..., 0]), dim=-1), way)
+        normal, drag = conditions.normal[:, :, terrain], outcome.drag[:, :, terrain]
+        tangent = torch.stack((normal[..., 1], -normal[..., 0]), dim=-1)
+        # A grip on rigid ground holds with more; what slips, with what friction allows.
+        sticks = outcome.first & (outcome.mode[:, :, terrain] == int(ContactMode.STICK))
+        eased = torch.where(sticks, conditions.stiffness_along(tangent), 0.0)
+        for _ in range(2):  # The row before has been eased too.
+            way = softness * (rows.before(drag) - outcome.drag[:, :, terrain])
+            way = way / (1.0 + softness * eased)
+            way = torch.where(outcome.load[:, :, terrain] > 0, way, 0.0)
+            drag = outcome.drag[:, :, terrain] + eased * way
+        give = give + pose_change(tangent, way)
     return replace(conditions, give=give)
 
 
@@ -128,7 +139,7 @@ CONTACT_EFFECTS = (
         _compliance(FLOOR),
         "the floor yields {0}",
         needs=("floor loads",),
-        passes=2,
+        passes=1,
     ),
     DeclaredEffect(
         "wall_compliance",
@@ -137,7 +148,7 @@ CONTACT_EFFECTS = (
         _compliance(WALL),
         "the wall yields {0}",
         needs=("wall loads",),
-        passes=2,
+        passes=1,
     ),
     DeclaredEffect(
         "tangential_compliance",
@@ -146,7 +157,7 @@ CONTACT_EFFECTS = (
         _tangential_compliance,
         "contacts that stick yield sideways by {0}",
         needs=("floor stick",),
-        passes=2,
+        passes=1,
     ),
     DeclaredEffect(
         "adhesion",

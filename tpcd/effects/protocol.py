@@ -119,8 +119,10 @@ class Added:
 
     @property
     def passes(self) -> int:
-        """How often the steps are solved before the conditions stand."""
-        return max((effect.passes for effect in self.effects), default=0)
+        """How often the steps are solved before the conditions stand: once more where several
+        effects answer to the outcome, and so to each other."""
+        passes = [effect.passes for effect in self.effects if effect.passes]
+        return max(passes, default=0) + (len(passes) > 1)
 
     def apply(self, conditions: Conditions, rows: Rows, outcome: Outcome | None) -> Conditions:
         """The conditions with all effects, site by site.

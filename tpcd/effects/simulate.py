@@ -48,7 +48,7 @@ def simulate_rows(
     for _ in range((added.passes if passes is None else passes) + 1):
         conditions = added.apply(base, rows, outcome)
         transition = _settle(scene, conditions, rows, index, settings)
-        outcome = _outcome(transition, rows, index)
+        outcome = _outcome(transition, rows, index, first=outcome is None)
     return _read(transition, conditions, index)
 
 
@@ -76,7 +76,7 @@ class RowByRow:
         contact = start.new_zeros(m, len(commands), terrains)
         self._past = Outcome(
             start.expand(m, len(commands), 3), contact.long(), contact, contact,
-            torch.stack((contact, contact), dim=-1),
+            torch.stack((contact, contact), dim=-1), contact[..., 0] > 0,
         )  # fmt: skip
 
     def settle(self, row: int, start: Float[Tensor, "m 3"]) -> SimulatedRows:
@@ -88,7 +88,7 @@ class RowByRow:
         conditions = self._first
         for left in range(self._added.passes, -1, -1):
             transition = _settle(self._scene, conditions, rows, index, self._settings)
-            now = _outcome(transition, rows, index)
+            now = _outcome(transition, rows, index, first=left == self._added.passes)
             parts = zip(vars(now).items(), vars(self._past).values(), strict=True)
             seen = Outcome(
                 **{name: torch.where(_along(here, new), new, old) for (name, new), old in parts}
@@ -137,7 +137,7 @@ def _settle(
     return replace(transition, pose=transition.pose + moved)
 
 
-def _outcome(transition: Transition, rows: Rows, index: Tensor) -> Outcome:
+def _outcome(transition: Transition, rows: Rows, index: Tensor, first: bool) -> Outcome:
     m, terrains = len(transition.pose), transition.mode.shape[-1]
     pose = rows.starts.expand(m, -1, -1).clone()
     pose[:, index] = transition.pose
@@ -145,7 +145,8 @@ def _outcome(transition: Transition, rows: Rows, index: Tensor) -> Outcome:
     mode[:, index] = transition.mode
     contacts = pose.new_zeros(m, len(rows.share), terrains, 4)
     contacts[:, index] = transition.contacts.nan_to_num(0.0)
-    return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:])
+    whether = torch.full(pose.shape[:2], first, device=pose.device)
+    return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:], whether)
 
 
 def _along(rows: Tensor, value: Tensor) -> Tensor:

@@ -163,3 +163,16 @@ def test_the_time_of_a_way_is_that_of_its_slowest_axis_and_the_short_way_round()
     far, turned = np.array([0.1, 0.05, 3.1]), np.array([0.0, 0.0, -3.1])
     assert travel_time(law, state, far) == pytest.approx(0.1 / x)
     assert travel_time(law, state, turned) == pytest.approx((2 * np.pi - 6.2) / angle)
+
+
+def test_a_long_flat_side_is_turned_slower_instead_of_ending_the_run() -> None:
+    """24 cm of brick are far stiffer against turning than the floor that was stated."""
+    servo, _ = wired_servo(outline="brick", surface_mm_per_10n=3.0)
+    scene = emulated_scene(emulator_settings(outline="brick"))
+    lowest = float(scene.vertices_ee[:, 1].min())
+    command = np.array([float(scene.start_pose[0]), scene.floor_height - lowest - 0.03, 0.0])
+    before = servo._law
+    for angle in (0.0, 0.1, -0.1):
+        assert servo.settle(command + np.array([0.0, 0.0, angle])).settled
+    assert servo._law.damping[2] > before.damping[2]
+    assert servo._law.damping[:2] == before.damping[:2]

@@ -115,6 +115,13 @@ def settings_for_surface(
     )
 
 
+def turning_slower(settings: AdmittanceSettings) -> AdmittanceSettings:
+    """The same with twice the damping of the angle in contact: how far the object reaches, and so
+    how stiff its flat faces are against turning, is not known beforehand."""
+    x, z, angle = settings.damping
+    return replace(settings, damping=(x, z, 2.0 * angle))
+
+
 @dataclass(frozen=True)
 class Mark:
     """The way on which the wrench has not changed."""

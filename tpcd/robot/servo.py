@@ -21,6 +21,7 @@ from tpcd.robot.admittance import (
     for_new_command,
     residual,
     travel_time,
+    turning_slower,
 )
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.frames import TaskFrame, planar_pose, planar_wrench
@@ -39,6 +40,8 @@ RAMP_SPEED = 0.03
 """Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
 RAMP_FORCE, RETREAT_FORCE = 4.0, 10.0
 """Further force that ends a move in free air, and a retreat, at whose start friction turns [N]."""
+SLOWER_TURNS = 3
+"""How often the damping of the angle is doubled before an oscillation ends the run."""
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -54,7 +57,7 @@ class Servo:
         """Where the arm is sent; None while it is only read."""
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
-        self._over, self._retreating = 0, False
+        self._over, self._retreating, self._slower = 0, False, 0
 
     def read(self) -> tuple[Sample, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """The next reading, checked and recorded."""
@@ -157,6 +160,11 @@ class Servo:
             if count % 12:
                 continue
             if window.unstable():
+                if self._slower < SLOWER_TURNS:
+                    self._slower += 1
+                    self._law, law = turning_slower(self._law), turning_slower(law)
+                    window, began = Window(self.settling, self.noise), sample.stamp
+                    continue
                 raise RobotError(
                     "the force oscillates: the surface is stiffer than stated, or the arm slower;"
                     f" state less than {self.settings.surface_mm_per_10n:g} mm per 10 N"

@@ -151,6 +151,32 @@ def test_a_box_jammed_between_floor_and_wall_is_answered_without_friction(engine
 
 
 @ENGINES
+@SIDES
+@pytest.mark.parametrize("mu", [0.6, 1.2, 2.0])
+def test_a_disc_that_is_turned_in_a_corner_slips_on_both_terrains(engine, mu, side):
+    """However rough they are: the law would also let it hold, by forces of thousands of newtons
+    between floor and wall that nothing presses it with. Closed form of Coulomb friction."""
+    radius, turn = 0.04, 0.12
+    angle = torch.arange(720, dtype=torch.float64) * math.pi / 360
+    disc = radius * torch.stack((angle.cos(), angle.sin()), dim=-1)
+    scene = ContactScene(
+        disc, (floor(vector(0.0)[0]), wall(vector(0.1)[0])), torch.full_like(vector(0, 0), mu)
+    )
+    start = vector(0.1 - radius, radius, 0)
+    # The arm presses with 5 N on the terrain that friction draws the disc away from.
+    right, down = (5.0, 1.0) if side > 0 else (1.0, 5.0)
+    command = start + vector(right / 100, -down / 100, side * turn)
+    result = step(scene, start, command, engine)
+    on_floor = (down + side * mu * right) / (1 + mu**2)
+    on_wall = (right - side * mu * down) / (1 + mu**2)
+    torque = mu * radius * (on_floor + on_wall)
+    loads = result.contacts[..., 0]
+    torch.testing.assert_close(loads, vector(on_floor, on_wall), atol=1e-3, rtol=0)
+    assert_near(result.pose[:2], 0.1 - radius, radius, atol=1e-6)
+    assert_near(result.pose[2:], side * (turn - torque / 50), atol=1e-4)
+
+
+@ENGINES
 def test_a_corridor_too_low_for_the_object_is_answered_near_it_and_flagged(engine):
     """Regression: floor and ceiling closer than the box once recursed without end."""
     one = torch.ones((), dtype=torch.float64)

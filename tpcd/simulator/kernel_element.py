@@ -13,7 +13,7 @@ from numba import njit
 from tpcd.simulator.kernel_geometry import first_touch, touching
 from tpcd.simulator.kernel_linear import linear_system
 from tpcd.simulator.kernel_request import sound, wrap
-from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, settle
+from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, settle, wedged
 from tpcd.simulator.kernel_slopes import (
     append_part,
     append_theta,
@@ -21,6 +21,10 @@ from tpcd.simulator.kernel_slopes import (
     landing_response,
     settling_response,
 )
+
+PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
+"""Attempts at settling: as it is; what is wedged or jammed, without friction; from there with it
+again; what does not slip, as it is after all, or without friction if it is jammed."""
 
 
 @njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
@@ -98,14 +102,24 @@ def step_element(
                 whole[a, a] = follows
         else:
             landing_response(world, o, start, part, fraction, point, terrain, slopes)
-            relaxed = False
+            attempt, jammed = PLAIN, False
             while True:
-                ended, left = settle(world, o, chains, law, extent, landing, part, space, pose)
-                if ended != RELAXED or relaxed:
+                ended, left = settle(
+                    world, o, chains, law, extent, landing, part, space, pose, attempt != SLIPPING
+                )
+                held = ended == CONVERGED and wedged(world, o, law, space)
+                following = _after(attempt, ended, held, jammed)
+                if following == attempt:
                     break
-                relaxed = True  # Jammed: once more without friction.
+                if attempt == PLAIN:
+                    jammed = ended == RELAXED
+                    for t in range(terrains):
+                        space.friction[t] = world.friction[o, t]
+                attempt = following
                 for t in range(terrains):
-                    space.friction[t], world.friction[o, t] = world.friction[o, t], 0.0
+                    loose = attempt in (LOOSE, FRICTIONLESS)
+                    world.friction[o, t] = 0.0 if loose else space.friction[t]
+            relaxed = attempt == FRICTIONLESS
             if relaxed:
                 if ended == RELAXED:
                     status = JAMMED
@@ -140,6 +154,19 @@ def step_element(
     copy_rows(whole, 0, answer.from_start[b], 3)
     copy_rows(whole, 3, answer.from_gap[b], terrains)
     copy_rows(whole, 3 + terrains, answer.from_lever[b], terrains)
+
+
+@njit(_nrt=False)
+@no_type_check
+def _after(attempt, ended, held, jammed):
+    """The attempt at settling that follows one that ended so; itself where none does."""
+    if attempt == PLAIN and (held or ended == RELAXED):
+        return LOOSE
+    if attempt == LOOSE and ended == CONVERGED:
+        return SLIPPING
+    if attempt == LOOSE or attempt == SLIPPING and (held or ended != CONVERGED):
+        return FRICTIONLESS if jammed else WEDGED
+    return attempt
 
 
 @njit(_nrt=False)

@@ -21,6 +21,8 @@ from tpcd.simulator.kernel_space import LIST
 
 NEWTON_ROUNDS = 6
 """Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
+WEDGE = 0.8
+"""Product of two friction coefficients from which on terrains may wedge, as in `settle`."""
 PROBE = 0.02
 """Rotation [rad] whose lowest points are candidates too, as in `settle`."""
 NEAR = 1e-4
@@ -33,14 +35,17 @@ _SOLVED = int(Status.SOLVED)
 
 @njit(error_model="numpy", _nrt=False, forceinline=True)
 @no_type_check
-def settle(world, o, chains, law, extent, start, command, space, pose):
-    """Settle one element; leaves pose and loaded contacts, returns status and residual."""
+def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
+    """Settle one element, `afresh` from the start or from `pose`; leaves pose and loaded contacts,
+    returns status and residual."""
     terrains = world.normals.shape[1]
     for t in range(terrains):
-        space.counts[t] = 0
+        if afresh:
+            space.counts[t] = 0
         space.load[t] = 0.0
     for a in range(3):
-        pose[a] = start[a]
+        if afresh:
+            pose[a] = start[a]
         space.chosen[a, 0] = -1
         space.multiplier[a] = 0.0
     status, residual = NOT_CONVERGED, np.inf
@@ -79,6 +84,26 @@ def settle(world, o, chains, law, extent, start, command, space, pose):
                     if space.chosen[a, 0] >= 0:
                         space.load[space.chosen[a, 1]] += space.gain[a]
     return status, residual
+
+
+@njit(_nrt=False)
+@no_type_check
+def wedged(world, o, law, space):
+    """Whether two terrains hold the settled element that can press on each other through it."""
+    first, second = -1, -1
+    for j in range(3):
+        if space.chosen[j, 0] < 0:
+            continue
+        if space.slipping[j]:
+            return False
+        t = space.chosen[j, 1]
+        if first < 0 or t == first:
+            first = t
+        else:
+            second = t
+    if second < 0 or not law.coulomb:
+        return False
+    return world.friction[o, first] * world.friction[o, second] >= WEDGE
 
 
 @njit(_nrt=False, forceinline=True)

@@ -11,10 +11,13 @@ point, is Coulomb friction (De Saxce and Feng 1998). `load` is the normal force 
 terrain and c its compliance. Each round re-linearises everything at the last solution, so
 the answer holds for the turned outline and not only for its first linearisation.
 
-With mu >= 1 an object that starts in penetration between two terrains can be jammed: no
-motion satisfies its rows. It is answered without friction, which is always possible and
-pushes it out the shortest way, and flagged RELAXED. This file works on tensors of any
-device; `native` is the same in compiled loops.
+With mu >= 1 an object between two terrains, say in a corner, can be wedged: the law then allows
+both that it slips and that it holds, by forces between the terrains that nothing has pressed it
+with. One that starts in penetration can even be jammed: no motion satisfies its rows. The fixed
+point is then sought from the other end, the pose without friction. Only where it does not slip
+from there does a wedge hold; and what is jammed stays without friction, which pushes it out the
+shortest way, and is flagged RELAXED. This file works on tensors of any device; `native` is the
+same in compiled loops.
 """
 
 from __future__ import annotations
@@ -35,6 +38,9 @@ PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
 NEWTON_ROUNDS = 6
 """Rounds in which a Newton step on Coulomb's law is tried; later ones are plain fixed point."""
+WEDGE = 0.8
+"""Product of the friction coefficients of two terrains from which on they may wedge the object: 1
+at right angles, 0.8 where one is tilted by 6 degrees."""
 
 
 @dataclass(frozen=True)
@@ -70,18 +76,48 @@ def settle(
 ) -> Settled:
     """Rest pose and loaded contacts for each element; no gradient is recorded."""
     with torch.no_grad():
-        return _settle(scene, start, command, stiffness, settings)
+        settled = _settle(scene, start, command, stiffness, settings)
+        jammed = (settled.status == int(StepStatus.RELAXED)) & (settings.friction == "coulomb")
+        index = torch.nonzero(jammed | _wedged(settled, scene, settings)).flatten()
+        if len(index) == 0:
+            return settled
+        part = scene.gather(index)
+        arguments = (start[index], command[index], own(stiffness, index), settings)
+        loose = _settle(part, *arguments, _settle(_without_friction(part), *arguments))
+        converged = loose.status == int(StepStatus.CONVERGED)
+        slips = torch.nonzero(converged & ~_wedged(loose, part, settings)).flatten()
+        for name in ("pose", "status", "residual", "yielding"):
+            getattr(settled, name)[index[slips]] = getattr(loose, name)[slips]
+        _put(settled.contacts, index[slips], _take(loose.contacts, slips))
+        return settled
+
+
+def _wedged(settled: Settled, scene: ContactScene, settings: StepSettings) -> Tensor:
+    """Held by two terrains at once that can press on each other through the object."""
+    contacts = settled.contacts
+    loaded = contacts.multiplier > 0
+    held = (settled.status == int(StepStatus.CONVERGED)) & ~(loaded & contacts.slipping).any(-1)
+    touched = _terrain_load(contacts, scene.friction.shape[-1]) > 0
+    grip = torch.where(touched, scene.friction, 1.0).prod(-1)
+    several = touched.sum(-1) > 1
+    return held & several & (grip >= WEDGE) & (settings.friction == "coulomb")
 
 
 def _settle(
-    scene: ContactScene, start: Tensor, command: Tensor, stiffness: Tensor, settings: StepSettings
+    scene: ContactScene,
+    start: Tensor,
+    command: Tensor,
+    stiffness: Tensor,
+    settings: StepSettings,
+    sought: Settled | None = None,
 ) -> Settled:
+    """The rest pose that is found from `sought`, or from the start."""
     count, terrains = scene.friction.shape
     device = start.device
-    pose = start.clone()
+    pose = (start if sought is None else sought.pose).clone()
     residual = torch.full_like(start[:, 0], torch.inf)
     status = torch.full((count,), int(StepStatus.NOT_CONVERGED), device=device)
-    contacts = _no_contacts(count, start)
+    contacts = _no_contacts(count, start) if sought is None else sought.contacts
     load = start.new_zeros(count, terrains)
     extent = scene.points_ee.norm(dim=-1).amax(-1)
     running = torch.arange(count, device=device)

@@ -20,6 +20,8 @@ from tpcd.belief.prior import make_prior
 from tpcd.belief.setting import PARITY_LIMIT
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
+from tpcd.effects.catalogue import find_effect
+from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
@@ -148,6 +150,37 @@ def test_compiled_loops_and_torch_agree_where_the_ground_gives_way(
     torch.testing.assert_close(found.steps.pose[likely], expected.steps.pose[likely])
     plain = evaluate(shape, particles, history).total
     assert (found.total[likely] - plain[likely]).abs().max() > 1
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
+    shape: PolygonShape,
+    episode: Episode,
+    particles: Tensor,
+    compiled: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Surfaces that yield answer to the change of load since then; a known outline."""
+    if not compiled:
+        monkeypatch.setattr(native, "available", lambda: False)
+    history = history_of(episode)
+    effects = tuple(find_effect(name) for name in ("floor_compliance", "tangential_compliance"))
+    added = Added(effects, torch.full((len(particles), 2), 4e-4, dtype=torch.float64))
+    sd = torch.zeros(len(particles), dtype=torch.float64)
+
+    def whitened(history: History) -> Tensor:
+        parameters = Parameters.from_vector(particles)
+        arguments = (shape, parameters, sd, history, FIELD, StepSettings())
+        found = history_likelihood(*arguments, innovations=True, added=added)
+        assert found.whitened is not None
+        return found.whitened
+
+    whole = whitened(history)
+    for k in range(len(history) - 1):
+        used = torch.arange(len(history)) != k
+        torch.testing.assert_close(
+            whitened(history.using(used))[:, k + 1], whole[:, k + 1], rtol=1e-6, atol=1e-6
+        )
 
 
 def test_no_term_exceeds_the_density_of_its_noise_at_zero(

@@ -10,14 +10,18 @@ from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
+from tpcd.contact import ContactScene
 from tpcd.discrepancy.formula import FORMULAS
 from tpcd.effects import CATALOGUE, Effect
+from tpcd.effects.conditions import Rows
 from tpcd.effects.protocol import Added
+from tpcd.effects.simulate import simulate_rows
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import QuasistaticTruth, StepSettings, native
+from tpcd.terrain import floor, wall
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -152,6 +156,27 @@ def test_one_pass_ends_where_many_end(
     none = run(hidden, *moves)
     assert (none - many)[:, :2].abs().max() > 2e-4
     torch.testing.assert_close(one[:, :3], many[:, :3], rtol=0, atol=3e-6)
+
+
+def test_pairs_of_rows_know_what_they_begin_with() -> None:
+    """A step from a grip, told as the command before and the next, ends where it does in a run."""
+    hidden = {"tangential_compliance": {"compliance": 5e-4}}
+    moves = ((0, -0.03, 0), (0.006, -0.03, 0), (-0.004, -0.05, 0), (0.004, -0.02, 0))
+    poses = run(hidden, *moves)[:, :3]
+    before, commands = (torch.tensor(m, dtype=torch.float64) for m in (moves[:-1], moves[1:]))
+    one = torch.ones(1, dtype=torch.float64)
+    scene = ContactScene(
+        BOX[None], (floor(0 * one), wall(WALL_AT * one)), torch.full((1, 2), FRICTION).double()
+    )
+    rows = Rows(
+        torch.arange(3).repeat_interleave(2) * 2,
+        torch.ones(6, dtype=torch.float64),
+        poses[:-1].repeat_interleave(2, dim=0),
+    )
+    asked = torch.stack((before, commands), dim=1).flatten(0, 1)
+    found = simulate_rows(scene, rows, asked, STIFFNESS, added_effects(hidden), StepSettings())
+    assert found.index.tolist() == [1, 3, 5]
+    torch.testing.assert_close(found.transition.pose[0], poses[1:], rtol=0, atol=2e-6)
 
 
 def test_a_contact_that_sticks_yields_sideways() -> None:

@@ -15,12 +15,15 @@ from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.augmented import found_effects, with_model
 from tpcd.belief.belief import Belief
 from tpcd.commands.prediction import measured_rows, prediction_error
+from tpcd.data.episode import read_episode
 from tpcd.effects import CATALOGUE
 from tpcd.effects.catalogue import find_effect
 from tpcd.effects.model import Model, load_model, write_model
 from tpcd.errors import ModelError
 from tpcd.predict import ContactPredictor
+from tpcd.random import stream
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
 from tpcd.truth.recording import Recording, make_motion, record
@@ -120,6 +123,15 @@ def test_an_estimate_from_other_data_starts_at_what_was_found(
     (parameter,) = effect.parameters
     assert (parameter.low, parameter.high) == pytest.approx((low, high))
     assert Model((SOFT, BIAS)).informed == (SOFT, BIAS)
+
+
+def test_an_estimate_with_effects_draws_more(world: Path) -> None:
+    episode = read_episode(world / "explore.csv")
+    few = SamplerSettings(particles=16, places=4, fresh_modes=4, modes=2, draws=200)
+    for effects, times in (((), 1), ((SOFT,), 3)):
+        settings = EstimatorSettings(sampler=few, effects=effects)
+        first = next(estimate(episode, load_prior("ycb21-z2"), stream(3), settings))
+        assert first.info.draws == 200 * times
 
 
 def test_without_anything_found_draws_are_of_the_prior(learnt) -> None:

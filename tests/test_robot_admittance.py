@@ -119,6 +119,20 @@ def test_nothing_is_still_while_it_oscillates() -> None:
             assert window.still() is None
 
 
+def test_what_rested_before_an_oscillation_says_nothing_of_what_comes_after() -> None:
+    """Then the arm creeps along against half a newton."""
+    window = Window(SettlingSettings(), np.array([0.2, 0.2, 0.01]))
+    for count in range(750):
+        time = 0.008 * count - 0.72
+        ring = 4.0 * math.sin(2 * math.pi * 8 * time) if 0 < time < 0.98 else 0.0
+        left = np.array([0.5 if time > 0 else 0.0, 0.0, 0.0])
+        pose = np.array([1.5e-3 * max(0.0, time), 0.0, 0.0])
+        window.add(0.008 * count, pose, np.array([0.0, 3.0 + ring, 0.0]), left)
+        if count % 12 == 0:
+            assert not window.unstable()
+            assert window.still() is None
+
+
 @pytest.mark.parametrize("command_z", [-0.002, -0.005, -0.008])
 def test_a_light_contact_is_no_limit_cycle(command_z: float) -> None:
     """Forces under the touch threshold: the lighter damping alone would be unstable there."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tpcd.belief.compiled import compiled_filter
@@ -66,6 +66,7 @@ def history_likelihood(
                 settings,
                 least[index],
                 added=None if added is None else added[index],
+                outcome=None if outcome is None else outcome[index],
             )
             return _spread(part, index, len(hopeless))
     inputs = (parameters.to_vector(), misfit_sd)
@@ -101,14 +102,15 @@ def effective_setting(
     base = history.setting(scene)
     passes = added.passes if outcome is None else 0
     for k in range(passes):
-        setting = _answering(base, history, added, outcome)
+        # What a row is loaded with counts for the next one, also where its transition does not.
+        setting = replace(_answering(base, history, added, outcome), used=~history.seams)
         arguments = (scene.points_ee, setting, misfit_sd, field, settings)
         if misfit_sd.device.type == "cpu" and native.available():
             found = compiled_filter(*arguments, steps=True)
         else:
             found = filter_history(*arguments, steps=True)
         assert found.steps is not None
-        outcome = outcome_of(found.steps, history, first=k == 0)
+        outcome = outcome_of(found.steps, history, setting.used, first=k == 0)
     return _answering(base, history, added, outcome), outcome
 
 
@@ -118,11 +120,13 @@ def _answering(base: Setting, history: History, added: Added, outcome: Outcome |
     return replace(base, conditions=conditions, merged=merged)
 
 
-def outcome_of(steps: Steps, history: History, first: bool = False) -> Outcome:
-    """The settled rows: those of the transitions, and readings where none leads to a row."""
+def outcome_of(
+    steps: Steps, history: History, used: Bool[Tensor, " n"], first: bool = False
+) -> Outcome:
+    """The settled rows: those of the transitions in use, and readings where none leads to a row."""
     m = len(steps.pose)
     pose = history.readings[:, :3].expand(m, -1, -1).clone()
-    stepped = history.used & steps.contacts.isfinite().all(-1).all(-1)
+    stepped = used & steps.contacts.isfinite().all(-1).all(-1)
     pose[:, 1:] = torch.where(stepped[..., None], steps.pose, pose[:, 1:])
     mode, contacts = (
         torch.cat((torch.zeros_like(value[:, :1]), value), dim=1)

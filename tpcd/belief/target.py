@@ -115,8 +115,8 @@ class ContactTarget:
         whitened = torch.cat((_known(here.whitened), parity), dim=1)
         log_scale = torch.cat((_known(here.log_scale), parity_scale), dim=1)
         slopes, stretch = [_known(here.slopes)], []
-        # Effects and the size of the misfit by differences; what the answer of effects to a change
-        # of contact forces adds to them is left out.
+        # Effects and the size of the misfit by differences. That contact forces, to which effects
+        # answer, change too is left out: 3 % of a standard deviation with three that yield.
         for entry in range(scene, s):
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE

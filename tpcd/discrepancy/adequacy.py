@@ -129,8 +129,8 @@ def innovations(
         scene.points_ee, setting, sd, question.misfit, fit.step, innovations=True, steps=True
     )
     assert found.whitened is not None and found.steps is not None
-    outcome = outcome_of(found.steps, history)
-    return found.whitened, Outcome(**{k: v[:1] for k, v in vars(outcome).items()}), weights
+    outcome = outcome_of(found.steps, history, setting.used)
+    return found.whitened, outcome[:1], weights
 
 
 def parity_score(history: History) -> tuple[float, float]:

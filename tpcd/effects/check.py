@@ -37,14 +37,14 @@ def check_effect(effect: Effect) -> None:
     low, high = parameter_bounds([effect])
     share = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)[:, None]
     values = low + share * (high - low)
-    for seen in (None, outcome):
+    for seen in (None, outcome, replace(outcome, first=~outcome.first)):
         name = _differing(conditions, _apply(effect, null.expand(_PARTICLES, -1), rows, seen))
         if name:
             raise EffectError(
                 effect.name, f"changes {name} at the null values of its parameters, expected no bit"
             )
         together = _apply(effect, values, rows, seen)
-        own = None if seen is None else Outcome(**{n: v[:1] for n, v in vars(seen).items()})
+        own = None if seen is None else seen[:1]
         alone = _apply(effect, values[:1], rows, own)
         first = Conditions(**{n: v[:1] for n, v in vars(together).items()})
         name = _differing(alone, first)

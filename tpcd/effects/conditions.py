@@ -53,12 +53,16 @@ class Outcome:
     arm: Float[Tensor, "m r t 2"]
     """From the end effector to the contact point, in world axes [m]."""
     first: Bool[Tensor, "m r"]
-    """Whether no effect had answered to an outcome yet: of the first pass."""
+    """Whether effects had no outcome to answer to when the row settled so."""
 
     @property
     def place(self) -> Float[Tensor, "m r t 2"]:
         """Contact point in the world [m]."""
         return self.pose[:, :, None, :2] + self.arm
+
+    def __getitem__(self, index: Tensor | slice) -> Outcome:
+        """Of some particles."""
+        return Outcome(**{name: value[index] for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 Under the load N that it has on rigid ground a surface would yield by c N, but as it does the arm's
 spring K eases, so that c N / (1 + c K) is where it ends. That is taken from the first pass; an
-error in a later one falls to c K times that of the one before. A surface that yields carries along
+error in a later one falls to c K times that of the one before, so c K should be less than 1 where
+there are later ones (K = 1000 N/m and 10 mm at 10 N make 1). A surface that yields carries along
 what it holds (`Conditions.give`), or a grip would be lost as the load changes. Where both surfaces
 hold the object, rigid friction leaves open how they share its load: passes need not converge.
 """

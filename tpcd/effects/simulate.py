@@ -39,17 +39,21 @@ def simulate_rows(
 ) -> SimulatedRows:
     """Settle every row from the start pose it has in `rows`; scenes and effects of m particles.
 
-    `passes` replaces the number that the effects ask for.
+    `passes` replaces the number that the effects ask for. Rows that follow no other have no
+    answer, but what they are loaded with where the arm rests off its command.
     """
     base = base_conditions(scene, commands, stiffness)
-    place = torch.arange(len(commands))
-    index = torch.nonzero(rows.follows != place).flatten()
+    follows = rows.follows != torch.arange(len(commands))
+    rests = (rows.starts != commands).any(-1)
+    rests = rests if rests.ndim == 1 else rests.any(0)
+    index, loaded = (torch.nonzero(which).flatten() for which in (follows, follows | rests))
     outcome = None
-    for _ in range((added.passes if passes is None else passes) + 1):
+    for k in range(added.passes if passes is None else passes):
         conditions = added.apply(base, rows, outcome)
-        transition = _settle(scene, conditions, rows, index, settings)
-        outcome = _outcome(transition, rows, index, first=outcome is None)
-    return _read(transition, conditions, index)
+        transition = _settle(scene, conditions, rows, loaded, settings)
+        outcome = _outcome(transition, rows, loaded, first=k == 0)
+    conditions = added.apply(base, rows, outcome)
+    return _read(_settle(scene, conditions, rows, index, settings), conditions, index)
 
 
 class RowByRow:
@@ -78,6 +82,8 @@ class RowByRow:
             start.expand(m, len(commands), 3), contact.long(), contact, contact,
             torch.stack((contact, contact), dim=-1), contact[..., 0] > 0,
         )  # fmt: skip
+        if added.passes:
+            self.settle(0, start.expand(m, 3))
 
     def settle(self, row: int, start: Float[Tensor, "m 3"]) -> SimulatedRows:
         """Settle the next row from the poses [m, m, rad] where the one before ended."""
@@ -139,8 +145,11 @@ def _settle(
 
 def _outcome(transition: Transition, rows: Rows, index: Tensor, first: bool) -> Outcome:
     m, terrains = len(transition.pose), transition.mode.shape[-1]
-    pose = rows.starts.expand(m, -1, -1).clone()
+    starts = rows.starts.expand(m, -1, -1)
+    pose = starts.clone()
     pose[:, index] = transition.pose
+    alone = (rows.follows == torch.arange(len(rows.follows)))[:, None]
+    pose = torch.where(alone, starts, pose)
     mode = torch.zeros(m, len(rows.share), terrains, dtype=torch.long)
     mode[:, index] = transition.mode
     contacts = pose.new_zeros(m, len(rows.share), terrains, 4)

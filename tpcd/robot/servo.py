@@ -42,6 +42,8 @@ RAMP_FORCE, RETREAT_FORCE = 4.0, 10.0
 """Further force that ends a move in free air, and a retreat, at whose start friction turns [N]."""
 SLOWER_TURNS = 3
 """How often the damping of the angle is doubled before an oscillation ends the run."""
+GENTLE = 2.5
+"""An oscillation of more than so many times what counts as one ends the run at once."""
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -160,7 +162,7 @@ class Servo:
             if count % 12:
                 continue
             if window.unstable():
-                if self._slower < SLOWER_TURNS:
+                if self._slower < SLOWER_TURNS and window.swing < GENTLE:
                     self._slower += 1
                     self._law, law = turning_slower(self._law), turning_slower(law)
                     window, began = Window(self.settling, self.noise), sample.stamp

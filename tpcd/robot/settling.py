@@ -137,7 +137,15 @@ class Window:
                 return True
         if self._ringing is None and swings.any():
             self._ringing = now, np.where(swings, size, 0.0)
+            self._rested = None  # What rested before it says nothing of what comes after.
         return False
+
+    @property
+    def swing(self) -> float:
+        """How much the wrench oscillates, in terms of `oscillation`; 0 where it does not."""
+        if self._ringing is None:
+            return 0.0
+        return float((self._ringing[1] * np.array([1.0, 1.0, 10.0])).max())
 
     def _swing(
         self,

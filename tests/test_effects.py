@@ -158,6 +158,20 @@ def test_one_pass_ends_where_many_end(
     torch.testing.assert_close(one[:, :3], many[:, :3], rtol=0, atol=3e-6)
 
 
+def test_effects_that_answer_to_each_other_get_one_pass_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the floor yields, what slips is dragged less, and holds so before it is let go."""
+    hidden = {name: {"compliance": 5e-4} for name in ("floor_compliance", "tangential_compliance")}
+    assert [added_effects({name: value}).passes for name, value in hidden.items()] == [1, 1]
+    moves = ((0, -0.03, 0), (0.03, -0.03, 0), (0.028, -0.03, 0), (0.024, -0.05, 0))
+    many, off = run(hidden, *moves), {}
+    for passes in (1, added_effects(hidden).passes):
+        monkeypatch.setattr("tpcd.effects.truth.TRUE_PASSES", passes)
+        off[passes] = float((run(hidden, *moves) - many)[:, :2].abs().max())
+    assert off[1] > 1e-5 and off[2] < 0.1 * off[1], off
+
+
 def test_pairs_of_rows_know_what_they_begin_with() -> None:
     """A step from a grip, told as the command before and the next, ends where it does in a run."""
     hidden = {"tangential_compliance": {"compliance": 5e-4}}

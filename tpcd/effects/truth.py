@@ -18,7 +18,7 @@ from tpcd.simulator.truth import TRUTH_SETTINGS
 from tpcd.terrain import floor, wall
 
 TRUE_PASSES = 8
-"""Passes in which the effects settle; the estimator makes do with one or two."""
+"""Passes in which the effects settle; the estimator makes do with one to three."""
 
 
 def added_effects(

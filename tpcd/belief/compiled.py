@@ -80,9 +80,9 @@ def compiled_filter(
     slopes = total.new_full((shape[0], by_theta.offsets.shape[1], *shape[1:]), torch.nan)
     kept = (count if steps else 0, n)
     settled = Steps(
-        total.new_zeros(*kept, 3),
+        total.new_full((*kept, 3), torch.nan),
         torch.zeros(*kept, terrains, dtype=torch.long),
-        total.new_zeros(*kept, terrains, 4),
+        total.new_full((*kept, terrains, 4), torch.nan),
     )
     answers = (
         total,

@@ -145,7 +145,8 @@ class Window:
         """How much the wrench oscillates, in terms of `oscillation`; 0 where it does not."""
         if self._ringing is None:
             return 0.0
-        return float((self._ringing[1] * np.array([1.0, 1.0, 10.0])).max())
+        most = self._ringing[1] * np.array([1.0, 1.0, 10.0])
+        return float(most.max()) / self.settings.oscillation
 
     def _swing(
         self,

@@ -13,7 +13,7 @@ from numba import njit
 from tpcd.simulator.kernel_geometry import first_touch, touching
 from tpcd.simulator.kernel_linear import linear_system
 from tpcd.simulator.kernel_request import sound, wrap
-from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, settle, wedged
+from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, may_wedge, settle
 from tpcd.simulator.kernel_slopes import (
     append_part,
     append_theta,
@@ -23,8 +23,8 @@ from tpcd.simulator.kernel_slopes import (
 )
 
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
-"""Attempts at settling: as it is; what is wedged or jammed, without friction; from there with it
-again; what does not slip, as it is after all, or without friction if it is jammed."""
+"""Attempts at settling: as it is; what may be wedged or is jammed, without friction; from there
+with it again; if that is no better, as it is after all, or without friction if it is jammed."""
 
 
 @njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
@@ -102,23 +102,27 @@ def step_element(
                 whole[a, a] = follows
         else:
             landing_response(world, o, start, part, fraction, point, terrain, slopes)
-            attempt, jammed = PLAIN, False
+            attempt, first, most = PLAIN, CONVERGED, np.inf
             while True:
                 ended, left = settle(
                     world, o, chains, law, extent, landing, part, space, pose, attempt != SLIPPING
                 )
-                held = ended == CONVERGED and wedged(world, o, law, space)
-                following = _after(attempt, ended, held, jammed)
+                load = 0.0
+                for j in range(3):
+                    load += space.multiplier[j]
+                if attempt == PLAIN:
+                    first, most = ended, load
+                    if not may_wedge(world, o, law, space) and ended != RELAXED:
+                        break
+                following = _after(attempt, first, ended, law.coulomb, load < 0.999 * most)
                 if following == attempt:
                     break
-                if attempt == PLAIN:
-                    jammed = ended == RELAXED
-                    for t in range(terrains):
-                        space.friction[t] = world.friction[o, t]
-                attempt = following
                 for t in range(terrains):
-                    loose = attempt in (LOOSE, FRICTIONLESS)
+                    if attempt == PLAIN:
+                        space.friction[t] = world.friction[o, t]
+                    loose = following in (LOOSE, FRICTIONLESS)
                     world.friction[o, t] = 0.0 if loose else space.friction[t]
+                attempt = following
             relaxed = attempt == FRICTIONLESS
             if relaxed:
                 if ended == RELAXED:
@@ -158,14 +162,16 @@ def step_element(
 
 @njit(_nrt=False)
 @no_type_check
-def _after(attempt, ended, held, jammed):
-    """The attempt at settling that follows one that ended so; itself where none does."""
-    if attempt == PLAIN and (held or ended == RELAXED):
-        return LOOSE
+def _after(attempt, first, ended, coulomb, lighter):
+    """The attempt at settling that follows one that ended so, when the `first` did not satisfy or
+    may be wedged; itself where none does."""
+    if attempt == PLAIN:
+        return LOOSE if coulomb else FRICTIONLESS
     if attempt == LOOSE and ended == CONVERGED:
         return SLIPPING
-    if attempt == LOOSE or attempt == SLIPPING and (held or ended != CONVERGED):
-        return FRICTIONLESS if jammed else WEDGED
+    taken = attempt == SLIPPING and ended == CONVERGED and (lighter or first != CONVERGED)
+    if attempt in (LOOSE, SLIPPING) and not taken:
+        return FRICTIONLESS if first == RELAXED else WEDGED
     return attempt
 
 

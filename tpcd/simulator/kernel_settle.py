@@ -23,6 +23,8 @@ NEWTON_ROUNDS = 6
 """Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
 WEDGE = 0.8
 """Product of two friction coefficients from which on terrains may wedge, as in `settle`."""
+PATIENCE = 3
+"""Times as many rounds where it does not start afresh, as in `settle`."""
 PROBE = 0.02
 """Rotation [rad] whose lowest points are candidates too, as in `settle`."""
 NEAR = 1e-4
@@ -49,8 +51,9 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
         space.chosen[a, 0] = -1
         space.multiplier[a] = 0.0
     status, residual = NOT_CONVERGED, np.inf
+    rounds = law.rounds if afresh else PATIENCE * law.rounds
     start_turn = (math.cos(start[2]), math.sin(start[2]))
-    for k in range(law.rounds):
+    for k in range(rounds):
         turn = (math.cos(pose[2]), math.sin(pose[2]))
         _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space)
         m = _build_rows(world, o, law, command, pose, turn, space)
@@ -78,7 +81,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
             respond(space)
             step = space.change
             # A step beyond what this round moved comes from a wrong guess of the contacts.
-            if abs(step[0]) + abs(step[1]) + abs(step[2]) * extent <= 2.0 * residual:
+            if max(abs(step[0]), abs(step[1])) + abs(step[2]) * extent <= 2.0 * residual:
                 for a in range(3):
                     pose[a] += step[a]
                     if space.chosen[a, 0] >= 0:
@@ -88,19 +91,16 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
 
 @njit(_nrt=False)
 @no_type_check
-def wedged(world, o, law, space):
-    """Whether two terrains hold the settled element that can press on each other through it."""
+def may_wedge(world, o, law, space):
+    """Whether two terrains load the settled element that can press on each other through it."""
     first, second = -1, -1
     for j in range(3):
-        if space.chosen[j, 0] < 0:
-            continue
-        if space.slipping[j]:
-            return False
-        t = space.chosen[j, 1]
-        if first < 0 or t == first:
-            first = t
-        else:
-            second = t
+        if space.chosen[j, 0] >= 0:
+            t = space.chosen[j, 1]
+            if first < 0 or t == first:
+                first = t
+            else:
+                second = t
     if second < 0 or not law.coulomb:
         return False
     return world.friction[o, first] * world.friction[o, second] >= WEDGE

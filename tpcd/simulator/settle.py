@@ -14,9 +14,9 @@ the answer holds for the turned outline and not only for its first linearisation
 With mu >= 1 an object between two terrains, say in a corner, can be wedged: the law then allows
 both that it slips and that it holds, by forces between the terrains that nothing has pressed it
 with. One that starts in penetration can even be jammed: no motion satisfies its rows. The fixed
-point is then sought from the other end, the pose without friction. Only where it does not slip
-from there does a wedge hold; and what is jammed stays without friction, which pushes it out the
-shortest way, and is flagged RELAXED. This file works on tensors of any device; `native` is the
+point is then sought from the other end too, the pose without friction, and that with less load
+is taken. What is jammed for all that stays without friction, which pushes it out the shortest
+way, and is flagged RELAXED. This file works on tensors of any device; `native` is the
 same in compiled loops.
 """
 
@@ -41,6 +41,8 @@ NEWTON_ROUNDS = 6
 WEDGE = 0.8
 """Product of the friction coefficients of two terrains from which on they may wedge the object: 1
 at right angles, 0.8 where one is tilted by 6 degrees."""
+PATIENCE = 3
+"""Times as many rounds from the pose without friction."""
 
 
 @dataclass(frozen=True)
@@ -77,30 +79,29 @@ def settle(
     """Rest pose and loaded contacts for each element; no gradient is recorded."""
     with torch.no_grad():
         settled = _settle(scene, start, command, stiffness, settings)
-        jammed = (settled.status == int(StepStatus.RELAXED)) & (settings.friction == "coulomb")
-        index = torch.nonzero(jammed | _wedged(settled, scene, settings)).flatten()
+        if settings.friction != "coulomb":
+            return settled
+        load = _terrain_load(settled.contacts, scene.friction.shape[-1])
+        grip = torch.where(load > 0, scene.friction, 1.0).prod(-1)
+        jammed = settled.status == int(StepStatus.RELAXED)
+        index = torch.nonzero(jammed | (((load > 0).sum(-1) > 1) & (grip >= WEDGE))).flatten()
         if len(index) == 0:
             return settled
         part = scene.gather(index)
-        arguments = (start[index], command[index], own(stiffness, index), settings)
-        loose = _settle(part, *arguments, _settle(_without_friction(part), *arguments))
-        converged = loose.status == int(StepStatus.CONVERGED)
-        slips = torch.nonzero(converged & ~_wedged(loose, part, settings)).flatten()
+        arguments = (start[index], command[index], own(stiffness, index))
+        free = _settle(_without_friction(part), *arguments, settings)
+        patient = replace(settings, rounds=PATIENCE * settings.rounds)
+        loose = _settle(part, *arguments, patient, free)
+        lighter = _terrain_load(loose.contacts, load.shape[-1]).sum(-1) < 0.999 * load[index].sum(
+            -1
+        )
+        failed = settled.status[index] != int(StepStatus.CONVERGED)
+        taken = (loose.status == int(StepStatus.CONVERGED)) & (lighter | failed)
+        taken = torch.nonzero(taken).flatten()
         for name in ("pose", "status", "residual", "yielding"):
-            getattr(settled, name)[index[slips]] = getattr(loose, name)[slips]
-        _put(settled.contacts, index[slips], _take(loose.contacts, slips))
+            getattr(settled, name)[index[taken]] = getattr(loose, name)[taken]
+        _put(settled.contacts, index[taken], _take(loose.contacts, taken))
         return settled
-
-
-def _wedged(settled: Settled, scene: ContactScene, settings: StepSettings) -> Tensor:
-    """Held by two terrains at once that can press on each other through the object."""
-    contacts = settled.contacts
-    loaded = contacts.multiplier > 0
-    held = (settled.status == int(StepStatus.CONVERGED)) & ~(loaded & contacts.slipping).any(-1)
-    touched = _terrain_load(contacts, scene.friction.shape[-1]) > 0
-    grip = torch.where(touched, scene.friction, 1.0).prod(-1)
-    several = touched.sum(-1) > 1
-    return held & several & (grip >= WEDGE) & (settings.friction == "coulomb")
 
 
 def _settle(

@@ -22,6 +22,8 @@ from tpcd.simulator.kernel_slopes import (
     settling_response,
 )
 
+LIGHTER = 0.999
+"""Share of the load below which an answer has less, as in `wedge`."""
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
 """Attempts at settling: as it is; what may be wedged or is jammed, without friction; from there
 with it again; if that is no better, as it is after all, or without friction if it is jammed."""
@@ -114,7 +116,7 @@ def step_element(
                     first, most = ended, load
                     if not may_wedge(world, o, law, space) and ended != RELAXED:
                         break
-                following = _after(attempt, first, ended, law.coulomb, load < 0.999 * most)
+                following = _after(attempt, first, ended, law.coulomb, load < LIGHTER * most)
                 if following == attempt:
                     break
                 for t in range(terrains):

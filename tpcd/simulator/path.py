@@ -15,7 +15,8 @@ from tpcd.simulator.flight import FREE_GAP, Flight, first_touch, touch_row
 from tpcd.simulator.implicit import linear_response, loaded_frames, newton_pose
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus, Transition
-from tpcd.simulator.settle import Settled, own, settle
+from tpcd.simulator.settle import Settled, own
+from tpcd.simulator.wedge import settle
 
 GRAZING = 1e-9
 """Share of the way's motion towards a terrain below which a touch only grazes it."""

@@ -11,13 +11,10 @@ point, is Coulomb friction (De Saxce and Feng 1998). `load` is the normal force 
 terrain and c its compliance. Each round re-linearises everything at the last solution, so
 the answer holds for the turned outline and not only for its first linearisation.
 
-With mu >= 1 an object between two terrains, say in a corner, can be wedged: the law then allows
-both that it slips and that it holds, by forces between the terrains that nothing has pressed it
-with. One that starts in penetration can even be jammed: no motion satisfies its rows. The fixed
-point is then sought from the other end too, the pose without friction, and that with less load
-is taken. What is jammed for all that stays without friction, which pushes it out the shortest
-way, and is flagged RELAXED. This file works on tensors of any device; `native` is the
-same in compiled loops.
+With mu >= 1 an object that starts in penetration between two terrains can be jammed: no
+motion satisfies its rows. It is answered without friction, which is always possible and
+pushes it out the shortest way, and flagged RELAXED. `wedge` looks for better answers there.
+These files work on tensors of any device; `native` is the same in compiled loops.
 """
 
 from __future__ import annotations
@@ -38,11 +35,6 @@ PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
 NEWTON_ROUNDS = 6
 """Rounds in which a Newton step on Coulomb's law is tried; later ones are plain fixed point."""
-WEDGE = 0.8
-"""Product of the friction coefficients of two terrains from which on they may wedge the object: 1
-at right angles, 0.8 where one is tilted by 6 degrees."""
-PATIENCE = 3
-"""Times as many rounds from the pose without friction."""
 
 
 @dataclass(frozen=True)
@@ -69,42 +61,7 @@ class _Rows:
     side: Tensor
 
 
-def settle(
-    scene: ContactScene,
-    start: Float[Tensor, "b 3"],
-    command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, "*each 3"],
-    settings: StepSettings,
-) -> Settled:
-    """Rest pose and loaded contacts for each element; no gradient is recorded."""
-    with torch.no_grad():
-        settled = _settle(scene, start, command, stiffness, settings)
-        if settings.friction != "coulomb":
-            return settled
-        load = _terrain_load(settled.contacts, scene.friction.shape[-1])
-        grip = torch.where(load > 0, scene.friction, 1.0).prod(-1)
-        jammed = settled.status == int(StepStatus.RELAXED)
-        index = torch.nonzero(jammed | (((load > 0).sum(-1) > 1) & (grip >= WEDGE))).flatten()
-        if len(index) == 0:
-            return settled
-        part = scene.gather(index)
-        arguments = (start[index], command[index], own(stiffness, index))
-        free = _settle(_without_friction(part), *arguments, settings)
-        patient = replace(settings, rounds=PATIENCE * settings.rounds)
-        loose = _settle(part, *arguments, patient, free)
-        lighter = _terrain_load(loose.contacts, load.shape[-1]).sum(-1) < 0.999 * load[index].sum(
-            -1
-        )
-        failed = settled.status[index] != int(StepStatus.CONVERGED)
-        taken = (loose.status == int(StepStatus.CONVERGED)) & (lighter | failed)
-        taken = torch.nonzero(taken).flatten()
-        for name in ("pose", "status", "residual", "yielding"):
-            getattr(settled, name)[index[taken]] = getattr(loose, name)[taken]
-        _put(settled.contacts, index[taken], _take(loose.contacts, taken))
-        return settled
-
-
-def _settle(
+def settle_from(
     scene: ContactScene,
     start: Tensor,
     command: Tensor,
@@ -112,7 +69,7 @@ def _settle(
     settings: StepSettings,
     sought: Settled | None = None,
 ) -> Settled:
-    """The rest pose that is found from `sought`, or from the start."""
+    """The rest pose and loaded contacts that are found from `sought`, or from the start."""
     count, terrains = scene.friction.shape
     device = start.device
     pose = (start if sought is None else sought.pose).clone()
@@ -127,15 +84,20 @@ def _settle(
         if len(running) == 0:
             break
         rows = _candidate_rows(
-            part, start[running], pose[running], _take(contacts, running), load[running], settings
+            part,
+            start[running],
+            pose[running],
+            take_contacts(contacts, running),
+            load[running],
+            settings,
         )
         step, found, relaxed = _solve_rows(
             rows, command[running] - pose[running], own(stiffness, running)
         )
         after = pose[running] + step
         found = _with_slip(part, start[running], after, found, settings.tolerance)
-        _put(contacts, running, found)
-        loaded_now = _terrain_load(found, terrains)
+        put_contacts(contacts, running, found)
+        loaded_now = terrain_load(found, terrains)
         sinking = settings.compliance * (loaded_now - load[running]).abs().amax(-1)
         load[running] = loaded_now
         change = _motion(step, extent[running]) + sinking
@@ -155,7 +117,7 @@ def _settle(
             small = _motion(polished - after, extent[running]) <= 2 * change
             trusted = ~settled & ~relaxed & small
             after = torch.where(trusted[:, None], polished, after)
-            polished_load = _terrain_load(replace(found, multiplier=multiplier), terrains)
+            polished_load = terrain_load(replace(found, multiplier=multiplier), terrains)
             load[running] = torch.where(trusted[:, None], polished_load, loaded_now)
         pose[running] = after
         status[running] = torch.where(
@@ -169,12 +131,12 @@ def _settle(
     jammed = torch.nonzero(status == int(StepStatus.RELAXED)).flatten()
     yielding = torch.zeros_like(status, dtype=torch.bool)
     if len(jammed) > 0 and bool((scene.friction[jammed] != 0).any()):
-        part = _without_friction(scene.gather(jammed))
+        part = without_friction(scene.gather(jammed))
         own_stiffness = own(stiffness, jammed)
-        free = _settle(part, start[jammed], command[jammed], own_stiffness, settings)
+        free = settle_from(part, start[jammed], command[jammed], own_stiffness, settings)
         pose[jammed], residual[jammed] = free.pose, free.residual
         yielding[jammed] = free.yielding
-        _put(contacts, jammed, free.contacts)
+        put_contacts(contacts, jammed, free.contacts)
     elif len(jammed) > 0:
         # Terrains that face each other jam without friction too.
         yielding[jammed] = True
@@ -186,7 +148,7 @@ def own(stiffness: Float[Tensor, "*each 3"], index: Tensor) -> Tensor:
     return stiffness if stiffness.ndim == 1 else stiffness[index]
 
 
-def _without_friction(scene: ContactScene) -> ContactScene:
+def without_friction(scene: ContactScene) -> ContactScene:
     return replace(scene, friction=torch.zeros_like(scene.friction))
 
 
@@ -284,7 +246,7 @@ def _motion(step: Tensor, extent: Tensor) -> Tensor:
     return step[:, :2].abs().amax(-1) + step[:, 2].abs() * extent
 
 
-def _terrain_load(contacts: ContactSet, terrains: int) -> Tensor:
+def terrain_load(contacts: ContactSet, terrains: int) -> Tensor:
     """Normal force on each terrain [N]: every row of a contact pushes with its multiplier."""
     load = contacts.multiplier.new_zeros(len(contacts.multiplier), terrains)
     return load.scatter_add(1, contacts.terrain, contacts.multiplier)
@@ -296,11 +258,11 @@ def _no_contacts(count: int, like: Tensor) -> ContactSet:
     return ContactSet(zeros, index, index.clone(), zeros.clone(), index.bool())
 
 
-def _take(contacts: ContactSet, index: Tensor) -> ContactSet:
+def take_contacts(contacts: ContactSet, index: Tensor) -> ContactSet:
     return ContactSet(*(getattr(contacts, name)[index] for name in _CONTACT_FIELDS))
 
 
-def _put(contacts: ContactSet, index: Tensor, values: ContactSet) -> None:
+def put_contacts(contacts: ContactSet, index: Tensor, values: ContactSet) -> None:
     for name in _CONTACT_FIELDS:
         getattr(contacts, name)[index] = getattr(values, name)
 

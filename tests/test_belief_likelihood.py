@@ -14,18 +14,20 @@ from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.compiled import compiled_filter
 from tpcd.belief.filtered import HistoryLikelihood, filter_history
 from tpcd.belief.history import History, history_of, parity_chi_square
-from tpcd.belief.likelihood import highest_terms, history_likelihood
+from tpcd.belief.likelihood import effective_setting, highest_terms, history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.belief.setting import PARITY_LIMIT
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.effects.catalogue import find_effect
+from tpcd.effects.conditions import Conditions
 from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings, StepStatus, native, simulate_step
+from tpcd.simulator import StepSettings, StepStatus, native
+from tpcd.simulator.settle import settle_from
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -160,27 +162,27 @@ def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
     compiled: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Surfaces that yield answer to the change of load since then; a known outline."""
+    """Surfaces that yield answer to the change of load since then."""
     if not compiled:
         monkeypatch.setattr(native, "available", lambda: False)
     history = history_of(episode)
     effects = tuple(find_effect(name) for name in ("floor_compliance", "tangential_compliance"))
     added = Added(effects, torch.full((len(particles), 2), 4e-4, dtype=torch.float64))
-    sd = torch.zeros(len(particles), dtype=torch.float64)
+    scene = scene_from_parameters(shape, Parameters.from_vector(particles))
+    sd = torch.full((len(particles),), FIELD.sd, dtype=torch.float64)
 
-    def whitened(history: History) -> Tensor:
-        parameters = Parameters.from_vector(particles)
-        arguments = (shape, parameters, sd, history, FIELD, StepSettings())
-        found = history_likelihood(*arguments, innovations=True, added=added)
-        assert found.whitened is not None
-        return found.whitened
+    def conditions(history: History) -> Conditions:
+        arguments = (scene, history, sd, FIELD, StepSettings(), added)
+        return effective_setting(*arguments)[0].conditions
 
-    whole = whitened(history)
+    whole = conditions(history)
+    assert whole.give.abs().max() > 1e-4
     for k in range(len(history) - 1):
-        used = torch.arange(len(history)) != k
-        torch.testing.assert_close(
-            whitened(history.using(used))[:, k + 1], whole[:, k + 1], rtol=1e-6, atol=1e-6
-        )
+        left_out = conditions(history.using(torch.arange(len(history)) != k))
+        for name in ("give", "offset"):
+            torch.testing.assert_close(
+                getattr(left_out, name)[:, k + 2], getattr(whole, name)[:, k + 2]
+            )
 
 
 def test_no_term_exceeds_the_density_of_its_noise_at_zero(
@@ -229,7 +231,8 @@ def test_a_nan_particle_is_impossible_and_changes_no_other(
 def test_a_jammed_particle_is_answered_like_the_torch_path(
     shape: PolygonShape, episode: Episode
 ) -> None:
-    """Friction of 1.5, and a floor and a wall that reach 1 mm into the object at its start."""
+    """Friction of 1.5, and a floor and a wall that reach 1 mm into the object at its start: no
+    motion satisfies what is linearised there."""
     prior, history = make_prior(shape), history_of(episode)
     names = prior.names
     jammed = prior.to_vector(prior.sample(40, torch.Generator().manual_seed(2)))
@@ -239,9 +242,9 @@ def test_a_jammed_particle_is_answered_like_the_torch_path(
     jammed[:, names.index("floor_height")] = at_start[..., 1].amin(-1) + 0.001
     jammed[:, names.index("wall_position")] = at_start[..., 0].amax(-1) - 0.001
     scene = scene_from_parameters(shape, Parameters.from_vector(jammed))
-    start, command, previous = history.start[1], history.command[1], history.previous[1]
-    step = (start, command, history.stiffness, StepSettings(), "torch", previous)
-    assert (simulate_step(scene, *step).status == int(StepStatus.RELAXED)).any()
+    starts, rest = (row[1].expand(40, 3) for row in (history.start, history.previous))
+    settled = settle_from(scene.double(), starts, rest, history.stiffness, StepSettings())
+    assert (settled.status == int(StepStatus.RELAXED)).any()
     sd = torch.full((len(jammed),), FIELD.sd, dtype=torch.float64)
     setting = history.setting(scene)
     expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())

@@ -21,12 +21,11 @@ from tpcd.simulator.kernel_slopes import (
     landing_response,
     settling_response,
 )
+from tpcd.simulator.wedge import LIGHTER
 
-LIGHTER = 0.999
-"""Share of the load below which an answer has less, as in `wedge`."""
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
-"""Attempts at settling: as it is; what may be wedged or is jammed, without friction; from there
-with it again; if that is no better, as it is after all, or without friction if it is jammed."""
+"""Attempts at settling (see `wedge`): as it is; what may be wedged or is jammed, without friction;
+from there with it again; if that is no better, as it is after all, or what jams without it."""
 
 
 @njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)

@@ -18,13 +18,10 @@ from tpcd.qp.problem import Status
 from tpcd.simulator.kernel_geometry import lowest_point, object_normal
 from tpcd.simulator.kernel_linear import linear_system, respond
 from tpcd.simulator.kernel_space import LIST
+from tpcd.simulator.wedge import PATIENCE, WEDGE
 
 NEWTON_ROUNDS = 6
 """Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
-WEDGE = 0.8
-"""Product of two friction coefficients from which on terrains may wedge, as in `wedge`."""
-PATIENCE = 3
-"""Times as many rounds where it does not start afresh, as in `wedge`."""
 PROBE = 0.02
 """Rotation [rad] whose lowest points are candidates too, as in `settle`."""
 NEAR = 1e-4

@@ -63,9 +63,9 @@ class _Rows:
 
 def settle_from(
     scene: ContactScene,
-    start: Tensor,
-    command: Tensor,
-    stiffness: Tensor,
+    start: Float[Tensor, "b 3"],
+    command: Float[Tensor, "b 3"],
+    stiffness: Float[Tensor, "*each 3"],
     settings: StepSettings,
     sought: Settled | None = None,
 ) -> Settled:
@@ -83,14 +83,8 @@ def settle_from(
     for k in range(settings.rounds):
         if len(running) == 0:
             break
-        rows = _candidate_rows(
-            part,
-            start[running],
-            pose[running],
-            take_contacts(contacts, running),
-            load[running],
-            settings,
-        )
+        loaded = take_contacts(contacts, running)
+        rows = _candidate_rows(part, start[running], pose[running], loaded, load[running], settings)
         step, found, relaxed = _solve_rows(
             rows, command[running] - pose[running], own(stiffness, running)
         )
@@ -149,6 +143,7 @@ def own(stiffness: Float[Tensor, "*each 3"], index: Tensor) -> Tensor:
 
 
 def without_friction(scene: ContactScene) -> ContactScene:
+    """The same scene on smooth terrains."""
     return replace(scene, friction=torch.zeros_like(scene.friction))
 
 
@@ -246,7 +241,7 @@ def _motion(step: Tensor, extent: Tensor) -> Tensor:
     return step[:, :2].abs().amax(-1) + step[:, 2].abs() * extent
 
 
-def terrain_load(contacts: ContactSet, terrains: int) -> Tensor:
+def terrain_load(contacts: ContactSet, terrains: int) -> Float[Tensor, "b t"]:
     """Normal force on each terrain [N]: every row of a contact pushes with its multiplier."""
     load = contacts.multiplier.new_zeros(len(contacts.multiplier), terrains)
     return load.scatter_add(1, contacts.terrain, contacts.multiplier)
@@ -258,11 +253,13 @@ def _no_contacts(count: int, like: Tensor) -> ContactSet:
     return ContactSet(zeros, index, index.clone(), zeros.clone(), index.bool())
 
 
-def take_contacts(contacts: ContactSet, index: Tensor) -> ContactSet:
+def take_contacts(contacts: ContactSet, index: Int[Tensor, " i"]) -> ContactSet:
+    """Those of some elements."""
     return ContactSet(*(getattr(contacts, name)[index] for name in _CONTACT_FIELDS))
 
 
-def put_contacts(contacts: ContactSet, index: Tensor, values: ContactSet) -> None:
+def put_contacts(contacts: ContactSet, index: Int[Tensor, " i"], values: ContactSet) -> None:
+    """Overwrite those of some elements, in place."""
     for name in _CONTACT_FIELDS:
         getattr(contacts, name)[index] = getattr(values, name)
 

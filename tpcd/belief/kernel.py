@@ -69,6 +69,7 @@ class Given(NamedTuple):
     offsets: np.ndarray
     friction: np.ndarray
     substeps: int
+    largest_turn: float
     follow_path: bool
 
 
@@ -137,6 +138,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         commands,
         False,
         given.substeps,
+        given.largest_turn,
         given.follow_path,
     )
     normals, offsets, friction = new_planes(terrains)

@@ -21,6 +21,7 @@ from tpcd.simulator.kernel_slopes import (
     landing_response,
     settling_response,
 )
+from tpcd.simulator.path import ALMOST
 from tpcd.simulator.wedge import LIGHTER
 
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
@@ -64,8 +65,9 @@ def step_element(
         whole[a, a] = 1.0
     touched, status, residual, relaxed = 0, CONVERGED, 0.0, False
     # Run 0 puts the start on what it rests against, run 1 goes straight to the command,
-    # runs 2.. follow the command's path where contact has changed.
-    rested, substeps = request.rested, request.substeps
+    # runs 2.. follow the command's path where contact has changed, or what is touched turns, and
+    # the last one goes straight again where that went worse.
+    rested, parts, straight = request.rested, 1, CONVERGED
     run, last = (1 if rested else 0), 1
     if rested:
         touched = touching(world, o, chains, pose)
@@ -79,8 +81,8 @@ def step_element(
         elif run == 0:
             share = 0.0
         else:
-            share = (run - 1) / substeps
-        if run == 2:
+            share = (run - 1) / parts if parts > 1 else 1.0
+        if run == 2 or run > 2 and parts == 1:
             copy_rows(slopes.kept, 0, whole, height)
             copy_rows(slopes.theta_kept, 0, theta, entries)
             for a in range(3):
@@ -143,11 +145,18 @@ def step_element(
                     world.friction[o, t] = space.friction[t]
         if run == 0:
             touched, status, residual = _loaded(space), CONVERGED, 0.0
-        elif run == 1 and substeps > 1:
+        elif run == 1 and request.substeps > 1:
             now = _loaded(space)
             changed = now != 0 and now != touched
             if request.follow_path or changed and (touched != 0 or now & (now - 1) != 0):
-                last = substeps + 1
+                parts = request.substeps
+            if now != 0 or touched != 0:
+                turns = abs(command[2] - before[2]) / request.largest_turn
+                parts = max(parts, math.ceil(turns - ALMOST))
+            if parts > 1:
+                straight, last = status, parts + 1
+        elif run == last and status > straight:
+            parts, straight, last = 1, status, last + 1
         run += 1
     for a in range(3):
         answer.poses[b, a] = pose[a]

@@ -18,6 +18,8 @@ from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepSta
 from tpcd.simulator.settle import Settled, own
 from tpcd.simulator.wedge import settle
 
+ALMOST = 1e-9
+"""Share of a part that is no part of its own."""
 GRAZING = 1e-9
 """Share of the way's motion towards a terrain below which a touch only grazes it."""
 
@@ -41,6 +43,11 @@ class _State:
         for name, value in vars(self).items():
             shape = (-1, *([1] * (value.ndim - 1)))
             values[name] = torch.where(condition.reshape(shape), value, getattr(other, name))
+        return _State(**values)
+
+    def put(self, index: Tensor, other: _State) -> _State:
+        """The other state at these elements, this one elsewhere."""
+        values = {k: v.index_copy(0, index, getattr(other, k)) for k, v in vars(self).items()}
         return _State(**values)
 
 
@@ -79,21 +86,23 @@ def follow_path(
     winding = changed & (touching.any(-1) | (loaded.sum(-1) > 1))
     if settings.follow_path:
         winding = torch.ones_like(winding)
-    index = torch.nonzero(winding).flatten()
-    if settings.substeps > 1 and len(index) > 0:
-        part_scene = scene.gather(index)
-        state = _State(**{name: value[index] for name, value in vars(begin).items()})
-        for k in range(1, settings.substeps + 1):
-            share, target = k / settings.substeps, command[index]
-            if k < settings.substeps:
-                target = path_start[index] + share * (target - path_start[index])
-            state = _advance(
-                part_scene, state, target, follows * (1 - share), own(stiffness, index), settings
+    turns = (command - path_start)[:, 2].detach().abs() / settings.largest_turn
+    turns = torch.where((loaded | touching).any(-1), (turns - ALMOST).ceil(), 1.0).long()
+    parts = torch.where(winding, settings.substeps, 1).maximum(turns)
+    if settings.substeps > 1 and bool((parts > 1).any()):
+        state = begin
+        for k in range(1, int(parts.max()) + 1):
+            index = torch.nonzero((parts >= k) & (parts > 1)).flatten()
+            share = (k / parts[index])[:, None]
+            target = path_start[index] + share * (command[index] - path_start[index])
+            target = torch.where(share < 1, target, command[index])
+            here = _State(**{name: value[index] for name, value in vars(state).items()})
+            rest = (follows * (1 - share))[..., None]
+            there = _advance(
+                scene.gather(index), here, target, rest, own(stiffness, index), settings
             )
-        spread = torch.zeros_like(winding, dtype=torch.long)
-        spread[index] = torch.arange(len(index), device=index.device)
-        followed = _State(**{name: value[spread] for name, value in vars(state).items()})
-        end = followed.where(winding, end)
+            state = state.put(index, there)
+        end = state.where((parts > 1) & (state.status <= end.status), end)
     return Transition(
         pose=torch.cat((end.pose[:, :2], wrap_angle(end.pose[:, 2:])), dim=-1),
         wrench=stiffness * (end.pose - command),
@@ -133,7 +142,7 @@ def _advance(
     scene: ContactScene,
     state: _State,
     target: Tensor,
-    follows: float,
+    follows: float | Tensor,
     stiffness: Tensor,
     settings: StepSettings,
 ) -> _State:

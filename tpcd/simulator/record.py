@@ -54,7 +54,10 @@ class StepSettings:
     `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
     substeps: int = 2
     """Parts into which the command's path is cut where contact with floor or wall is won or
-    lost on the way, since friction then depends on the path; other steps are one part."""
+    lost on the way, since friction then depends on the path; 1 cuts nothing, whatever else."""
+    largest_turn: float = 0.05
+    """Most that the command turns in one part where anything is touched [rad]: what rolls or
+    slips while it turns depends on the path too."""
     follow_path: bool = False
     """Cut every step into `substeps` parts, whether contact changes or not."""
     rounds: int = 20
@@ -72,6 +75,8 @@ class StepSettings:
             raise ValueError(
                 f"substeps {self.substeps} and rounds {self.rounds} must both be at least 1"
             )
+        if not self.largest_turn > 0:
+            raise ValueError(f"largest_turn is {self.largest_turn}, expected radians above 0")
         if self.compliance < 0 or self.tolerance <= 0:
             raise ValueError(
                 f"compliance {self.compliance} must be >= 0 and tolerance {self.tolerance} > 0"

@@ -24,6 +24,7 @@ from tpcd.robot.admittance import (
     turning_slower,
 )
 from tpcd.robot.arm_settings import ArmSettings
+from tpcd.robot.command_way import command_way, moved_on
 from tpcd.robot.frames import TaskFrame, planar_pose, planar_wrench
 from tpcd.robot.frames import tcp_pose as tcp_of
 from tpcd.robot.link import Link, Sample
@@ -60,6 +61,8 @@ class Servo:
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
         self._over, self._retreating, self._slower = 0, False, 0
+        self._command: np.ndarray | None = None
+        """The last one given way to; None where the arm went elsewhere since."""
 
     def read(self) -> tuple[Sample, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """The next reading, checked and recorded."""
@@ -100,6 +103,7 @@ class Servo:
     def ramp_to(self, goal: Float[np.ndarray, " 3"], allowed: float = RAMP_FORCE) -> None:
         """Straight to a pose; RobotError where a force grows by more than `allowed` [N]."""
         link, frame = self.link, self.frame
+        self._command = None
         before: np.ndarray | None = None
         waited = 0
         while waited < 0.3 * link.rate:
@@ -146,6 +150,8 @@ class Servo:
         window, last, began = Window(self.settling, self.noise), None, None
         law = replace(self._law, noise=tuple(self.noise.tolist()))
         self.state = for_new_command(self.state)
+        way = command_way(self.state.reference if self._command is None else self._command, command)
+        self._command = command
         longest = self.settings.settle_time + travel_time(law, self.state, command)
         longest += self.settling.window  # which is taken after the first still one
         count, still = 0, None
@@ -154,7 +160,9 @@ class Servo:
             began = sample.stamp if began is None else began
             passed = 1 / link.rate if last is None else sample.stamp - last
             last = sample.stamp
-            state = advance(law, self.state, command, wrench, min(passed, LARGEST_STEP))
+            step = min(passed, LARGEST_STEP)
+            way = moved_on(way, law.stiffness, self.state, step)
+            state = advance(law, self.state, way.command, wrench, step)
             self.state = state
             link.servo(tcp_of(frame, state.reference))
             window.add(sample.stamp, pose, wrench, residual(law, state, command))

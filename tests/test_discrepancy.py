@@ -22,7 +22,7 @@ from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, Coverage, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
-from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound
+from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound, typical_share
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import Workbench, fitted_again
 from tpcd.discrepancy.report_parts import shown_value
@@ -210,9 +210,12 @@ def test_where_something_is_left_effects_must_close_half_of_the_gap(
     final = fit_model(question, (find_effect("floor_tilt"),), (0,), start=(base,))
     cell = Cell("all", "z", "mean", 2.0, 30)
     left = Adequacy(0.3, 1e-9, 0.5, (cell,))
-    monkeypatch.setattr("tpcd.discrepancy.conclude._gap", lambda *_: ((), share))
+    monkeypatch.setattr("tpcd.discrepancy.conclude.typical_share", lambda *_: share)
+    monkeypatch.setattr("tpcd.discrepancy.conclude.gaps", lambda *_: ([], 1.0 - share))
     monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: left)
-    found = conclude(bench, Findings(base, final, left, left), [clean], ())
+    # What is closed on fresh episodes, here the rest, is shown and names nothing.
+    found = conclude(bench, Findings(base, final, left, left), [clean], [clean.first(6)])
+    assert found.share_closed == 1.0 - share if named else math.isnan(found.share_closed)
     assert found.verdict == "unknown_remains"
     assert found.names == (("floor_tilt",) if named else ())
     assert found.belief is not None and found.belief.prior.effects == final.effects[: int(named)]
@@ -348,6 +351,20 @@ def test_gaps_and_bounds_of_numbers_known_by_hand() -> None:
     assert lower_bound(gain, torch.Generator().manual_seed(0)) == pytest.approx(1.0)
     gain[: n // 2] = -1.0
     assert lower_bound(gain, torch.Generator().manual_seed(0)) < 0
+
+
+def test_a_row_in_another_contact_decides_nothing() -> None:
+    """All others go from five times the noise to once; one goes to thirty times."""
+    n = 40
+    noise = torch.full((n, 6), 0.1, dtype=torch.float64)
+    before, after = Errors(5 * noise, noise), Errors(noise.clone(), noise)
+    after.error[7] = 30 * noise[7]
+    assert gaps(before, after, torch.Generator().manual_seed(0))[1] < 0.1
+    # At most as far off as before: one row of forty.
+    assert typical_share(before, after) == pytest.approx(1 - 1 / n)
+    assert math.isnan(typical_share(Errors(noise, noise), Errors(noise, noise)))
+    worse = typical_share(before, Errors(6 * noise, noise))
+    assert worse == 0.0
 
 
 def test_every_transition_is_held_out_once(clean: Episode) -> None:

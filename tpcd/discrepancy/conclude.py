@@ -12,7 +12,7 @@ from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import Fit, fit_model, posterior
 from tpcd.discrepancy.formula import FORMULAS
-from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors
+from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors, typical_share
 from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.variants import NUMERICS, Variant
@@ -50,10 +50,16 @@ def conclude(
     gap: tuple[Gap, ...] = ()
     share = math.nan
     if found.final is not found.base:
-        gap, share = _gap(bench, found, episodes, fresh)
+        models = (found.base, found.final)
         left = settings.adequacy and not found.after.adequate(settings.level)
-        if left and not share >= HALF:
-            found, gap, share = _without_effects(bench, found, share), (), math.nan
+        held = [held_out_errors(bench.question, f, episodes) for f in models if left or not fresh]
+        closes = typical_share(*held) if left else math.nan
+        if left and not closes >= HALF:
+            found = _without_effects(bench, found, closes)
+        else:
+            shown = [prediction_errors(bench.question, f, fresh) for f in models] if fresh else held
+            channels, share = gaps(*shown, stream(settings.seed, 79))
+            gap = tuple(channels)
     first = _reported(bench, found.base)
     belief = first if found.final is found.base else _reported(bench, found.final)
     effects = (
@@ -140,18 +146,6 @@ def _verdict(
         others = " or ".join(" + ".join(a.names) for a in found.close)
         return "ambiguous", f"{told}; {others} would explain the data as well"
     return "named", told
-
-
-def _gap(
-    bench: Workbench, found: Findings, episodes: Sequence[Episode], fresh: Sequence[Episode]
-) -> tuple[tuple[Gap, ...], float]:
-    models = (found.base, found.final)
-    if fresh:
-        errors = [prediction_errors(bench.question, fit, fresh) for fit in models]
-    else:
-        errors = [held_out_errors(bench.question, fit, episodes) for fit in models]
-    gap, share = gaps(*errors, stream(bench.settings.seed, 79))
-    return tuple(gap), share
 
 
 def _shape_line(belief: Belief, variants: Sequence[Variant]) -> str:

@@ -26,6 +26,8 @@ BLOCK = 5
 RESAMPLES = 2000
 LEAST_EXCESS = 0.1
 """Share of the noise's variance that counts as a gap."""
+TYPICAL = 0.95
+"""Quantile of the squares before above which a square counts no more in what is typical."""
 FOLD_SAMPLER = SamplerSettings(
     particles=200, draws=1000, prior_draws=100, fresh_modes=24, rounds=2, modes=12
 )
@@ -118,9 +120,7 @@ def held_out_errors(question: Question, fit: Fit, episodes: Sequence[Episode]) -
 
 def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[list[Gap], float]:
     """The gap of each channel before and after, and the share closed of all of it."""
-    parts = (before.error, after.error, after.noise)
-    known = torch.stack([torch.isfinite(part).all(-1) for part in parts]).all(0)
-    *squares, floor = (torch.square(part[known]) for part in parts)
+    *squares, floor = _squares(before, after)
     n = len(floor)
     draws = _block_draws(n, generator)
 
@@ -146,11 +146,30 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[lis
                 *((math.nan, math.nan) if ends is None else ends.tolist()),
             )
         )
-    # All channels together, each in units of its noise.
-    was, now = ((part / floor).mean() - 1 for part in squares)
-    chance = max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / (n * len(CHANNELS))))
-    share = float((was - now.clamp_min(0.0)) / was) if was > chance else math.nan
-    return found, share
+    return found, _together(*(part / floor for part in squares))
+
+
+def typical_share(before: Errors, after: Errors) -> float:
+    """Share closed of all of the gap (nan where there is none), where no square counts for more
+    than nearly all do before: a single row that lands in another contact decides nothing."""
+    *squares, floor = _squares(before, after)
+    was, now = (part / floor for part in squares)
+    most = torch.quantile(was, TYPICAL)
+    return _together(was.clamp_max(most), now.clamp_max(most))
+
+
+def _squares(before: Errors, after: Errors) -> list[Float[Tensor, "n 6"]]:
+    """Squared errors before and after, and noise, of the rows in which all of them are known."""
+    parts = (before.error, after.error, after.noise)
+    known = torch.stack([torch.isfinite(part).all(-1) for part in parts]).all(0)
+    return [torch.square(part[known]) for part in parts]
+
+
+def _together(before: Float[Tensor, "n 6"], after: Float[Tensor, "n 6"]) -> float:
+    """Share closed of the gap of all channels, from squares in units of the noise."""
+    was, now = before.mean() - 1, after.mean() - 1
+    chance = max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / before.numel()))
+    return float((was - now.clamp_min(0.0)) / was) if was > chance else math.nan
 
 
 def _block_draws(n: int, generator: torch.Generator) -> Tensor:

@@ -69,7 +69,8 @@ class Experiment(ExploringOptions):
     stale_time: float = 0.04
     """Without a new reading for this long the link is lost [s]; more only for an emulator."""
     settle_time: float = 60.0
-    """Longest time to wait for a steady pose and force, on top of the way at full speed [s]."""
+    """Longest time to wait for a steady pose and force once the command has arrived, or for it to
+    get on, on top of the way at full speed [s]."""
     yes: bool = False
     """Workspace and limits are confirmed beforehand; nobody is asked."""
 

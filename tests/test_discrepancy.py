@@ -210,11 +210,20 @@ def test_where_something_is_left_effects_must_close_half_of_the_gap(
     final = fit_model(question, (find_effect("floor_tilt"),), (0,), start=(base,))
     cell = Cell("all", "z", "mean", 2.0, 30)
     left = Adequacy(0.3, 1e-9, 0.5, (cell,))
-    monkeypatch.setattr("tpcd.discrepancy.conclude.typical_share", lambda *_: share)
-    monkeypatch.setattr("tpcd.discrepancy.conclude.gaps", lambda *_: ([], 1.0 - share))
+    episodes, fresh = [clean], [clean.first(6)]
+    shares = {id(episodes): share, id(fresh): 1.0 - share}
+    for name in ("held_out_errors", "prediction_errors"):
+        monkeypatch.setattr(f"tpcd.discrepancy.conclude.{name}", lambda q, f, given: (f, given))
+
+    def closed(before, after):
+        assert before[0] is base and after[0] is final and before[1] is after[1]
+        return shares[id(after[1])]
+
+    monkeypatch.setattr("tpcd.discrepancy.conclude.typical_share", closed)
+    monkeypatch.setattr("tpcd.discrepancy.conclude.gaps", lambda *e: ([], closed(*e[:2])))
     monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: left)
     # What is closed on fresh episodes, here the rest, is shown and names nothing.
-    found = conclude(bench, Findings(base, final, left, left), [clean], [clean.first(6)])
+    found = conclude(bench, Findings(base, final, left, left), episodes, fresh)
     assert found.share_closed == 1.0 - share if named else math.isnan(found.share_closed)
     assert found.verdict == "unknown_remains"
     assert found.names == (("floor_tilt",) if named else ())
@@ -363,8 +372,11 @@ def test_a_row_in_another_contact_decides_nothing() -> None:
     # At most as far off as before: one row of forty.
     assert typical_share(before, after) == pytest.approx(1 - 1 / n)
     assert math.isnan(typical_share(Errors(noise, noise), Errors(noise, noise)))
-    worse = typical_share(before, Errors(6 * noise, noise))
-    assert worse == 0.0
+    assert typical_share(before, Errors(6 * noise, noise)) == 0.0
+    # What shows in a few rows and channels alone is a gap.
+    rare = Errors(noise.clone(), noise)
+    rare.error[:5, :2] = 8 * noise[:5, :2]
+    assert typical_share(rare, Errors(noise, noise)) == pytest.approx(1.0)
 
 
 def test_every_transition_is_held_out_once(clean: Episode) -> None:

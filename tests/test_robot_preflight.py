@@ -7,6 +7,7 @@ import pytest
 
 from tpcd.errors import RobotError
 from tpcd.robot.preflight import (
+    ARM,
     GRAVITY,
     FreeAir,
     check_before_zeroing,
@@ -87,13 +88,14 @@ def test_slow_noise_is_told_apart() -> None:
 
 
 def test_a_row_has_the_noise_of_a_window_s_mean_and_turns_it_into_motion() -> None:
-    """0.6 s of independent readings, a quarter of what may be left, half of what turning left."""
+    """0.6 s of independent readings, a quarter of what may be left, half of what turning left, and
+    what an arm does not know of its pose."""
     stiffness, count = np.array([100.0, 100.0, 50.0]), 0.6 * RATE
     left = 0.25 * np.array(SettlingSettings().residual)
     expected = np.sqrt(NOISE**2 / count + left**2)
     found = row_noise(air(seconds=30.0), 0.0, SettlingSettings(), stiffness)
     np.testing.assert_allclose(found[3:], expected, rtol=0.05)
-    np.testing.assert_allclose(found[:3], expected / stiffness, rtol=0.05)
+    np.testing.assert_allclose(found[:3], np.hypot(expected / stiffness, ARM), rtol=0.05)
     turned = row_noise(air(seconds=30.0), 0.4, SettlingSettings(), stiffness)
     np.testing.assert_allclose(turned[3:5], np.hypot(expected[:2], 0.2), rtol=0.05)
     assert turned[5] == found[5]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -64,6 +65,29 @@ def test_both_engines_rest_alike_under_the_previous_command():
     settled = (native.status == StepStatus.CONVERGED) & (reference.status == StepStatus.CONVERGED)
     near = (native.pose - reference.pose).abs().amax(-1) < 1e-6
     assert float((near & settled).double().mean()) > 0.96
+
+
+@pytest.mark.parametrize("rounds", [20, 3], ids=["settles", "often does not"])
+def test_both_engines_cut_turns_alike(rounds):
+    """Also where the parts end worse than the whole, which is then the answer."""
+    scene, start, first = many_random_transitions(40, seed=64)
+    rest = simulate_step(scene, start, first, STIFFNESS, engine="native")
+    turned = first + vector(0, 0, 0.24) * -first[:, 2:].sign()
+    settings = StepSettings(rounds=rounds)
+    native, reference = both(scene, rest.pose, turned, settings, previous=first)
+    whole, _ = both(scene, rest.pose, turned, replace(settings, substeps=1), previous=first)
+    parts, _ = both(scene, rest.pose, turned, replace(settings, rounds=20), previous=first)
+    alike = (native.pose - reference.pose).abs().amax(-1) < 1e-6
+    settled = (native.status == StepStatus.CONVERGED) & (reference.status == StepStatus.CONVERGED)
+    assert float(alike[settled].double().mean()) > 0.97
+    assert float((native.status == reference.status).double().mean()) > 0.97
+    assert (native.status <= whole.status).all()
+    fell_back = (native.pose == whole.pose).all(-1) & (whole.pose != parts.pose).any(-1)
+    assert bool(fell_back.any()) == (rounds == 3)
+    for name in ANSWERS:
+        torch.testing.assert_close(
+            getattr(native, name)[fell_back], getattr(whole, name)[fell_back]
+        )
 
 
 def test_resting_under_the_same_command_moves_nothing():

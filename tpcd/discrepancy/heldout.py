@@ -27,7 +27,7 @@ RESAMPLES = 2000
 LEAST_EXCESS = 0.1
 """Share of the noise's variance that counts as a gap."""
 TYPICAL = 0.95
-"""Quantile of the squares before above which a square counts no more in what is typical."""
+"""Share of the rows whose largest square before bounds what a number counts in what is typical."""
 FOLD_SAMPLER = SamplerSettings(
     particles=200, draws=1000, prior_draws=100, fresh_modes=24, rounds=2, modes=12
 )
@@ -150,11 +150,11 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[lis
 
 
 def typical_share(before: Errors, after: Errors) -> float:
-    """Share closed of all of the gap (nan where there is none), where no square counts for more
-    than nearly all do before: a single row that lands in another contact decides nothing."""
+    """Share closed of all of the gap (nan where there is none), where no number counts for more
+    than in nearly all rows before: a few rows that land in another contact decide nothing."""
     *squares, floor = _squares(before, after)
     was, now = (part / floor for part in squares)
-    most = torch.quantile(was, TYPICAL)
+    most = torch.quantile(was.amax(-1), TYPICAL)
     return _together(was.clamp_max(most), now.clamp_max(most))
 
 

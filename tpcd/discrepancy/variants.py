@@ -55,7 +55,13 @@ def relaxed_friction(question: Question) -> Question:
 def finer_steps(question: Question) -> Question:
     """The same with every path cut into more parts."""
     step = question.step
-    return replace(question, step=replace(step, substeps=FINER * step.substeps, follow_path=True))
+    finer = replace(
+        step,
+        substeps=FINER * step.substeps,
+        largest_turn=step.largest_turn / FINER,
+        follow_path=True,
+    )
+    return replace(question, step=finer)
 
 
 WIDE_SHAPE = Variant("wide_shape", "the object is unlike those of the shape prior", wide_shape)

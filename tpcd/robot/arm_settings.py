@@ -42,7 +42,8 @@ class ArmSettings:
     """Without a new reading for this long the link is lost [s]; more only for an emulator on a busy
     machine."""
     settle_time: float = 60.0
-    """Longest time to wait for a steady pose and force, on top of the way at full speed [s]."""
+    """Longest time to wait for a steady pose and force once the command has arrived, or for it to
+    get on, on top of the way at full speed [s]."""
     still_time: float = 3.0
     """Time in free air from which noise is measured [s]."""
     retreat: float = 0.03

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.robot.admittance import AdmittanceState
+from tpcd.robot.admittance import AdmittanceSettings, AdmittanceState, residual
 
-PULL = (1.0, 1.0, 0.5)
-"""What moves the arm at which its command waits [N, N, N·m]. With twice the torque, turns are a
-third quicker and their ends twice as far off (emulated)."""
+LEAD = (0.01, 0.01, 0.01)
+"""How far a command may be ahead of where the arm would rest [m, m, rad]; there it waits. With
+twice the angle, turns are a third quicker and end twice as far off (emulated)."""
 PACE = (0.05, 0.05, 0.4)
 """Speed of a command whose arm is at rest all along [m/s, m/s, rad/s]."""
 
@@ -47,10 +47,11 @@ def command_way(start: Float[np.ndarray, " 3"], goal: Float[np.ndarray, " 3"]) -
 
 
 def moved_on(
-    way: CommandWay, stiffness: tuple[float, float, float], state: AdmittanceState, step: float
+    way: CommandWay, settings: AdmittanceSettings, state: AdmittanceState, step: float
 ) -> CommandWay:
     """The command after `step` more seconds: the slower, the farther the arm is from rest."""
     needed = float((np.abs(way.way) / np.array(PACE)).max())
-    pull = np.array(stiffness) * (way.command - state.reference) + state.slow
-    pace = max(0.0, 1.0 - float((np.abs(pull) / np.array(PULL)).max()))
+    pull = residual(settings, replace(state, wrench=state.slow), way.command)
+    lead = np.abs(pull) / np.array(settings.stiffness)
+    pace = max(0.0, 1.0 - float((lead / np.array(LEAD)).max()))
     return replace(way, share=min(1.0, way.share + pace * step / needed) if needed else 1.0)

@@ -45,6 +45,8 @@ SLOWER_TURNS = 3
 """How often the damping of the angle is doubled before an oscillation ends the run."""
 GENTLE = 2.5
 """An oscillation of more than so many times what counts as one ends the run at once."""
+PROGRESS = 0.01
+"""Share of the command's way whose time is limited, while the arm follows."""
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -151,17 +153,19 @@ class Servo:
         law = replace(self._law, noise=tuple(self.noise.tolist()))
         self.state = for_new_command(self.state)
         way = command_way(self.state.reference if self._command is None else self._command, command)
-        self._command = command
         longest = self.settings.settle_time + travel_time(law, self.state, command)
         longest += self.settling.window  # which is taken after the first still one
-        count, still = 0, None
+        count, still, reached = 0, None, 0.0
         while still is None:
             sample, pose, wrench = self.read()
             began = sample.stamp if began is None else began
             passed = 1 / link.rate if last is None else sample.stamp - last
             last = sample.stamp
             step = min(passed, LARGEST_STEP)
-            way = moved_on(way, law.stiffness, self.state, step)
+            way = moved_on(way, law, self.state, step)
+            self._command = way.command
+            if reached < way.share and way.share >= min(reached + PROGRESS, 1.0):
+                began, reached = sample.stamp, way.share
             state = advance(law, self.state, way.command, wrench, step)
             self.state = state
             link.servo(tcp_of(frame, state.reference))
@@ -181,6 +185,12 @@ class Servo:
                 )
             still = window.still()
             if still is None and sample.stamp - began > longest:
+                if way.share < 1:
+                    raise RobotError(
+                        f"the command does not get on: the arm has not followed it beyond"
+                        f" {way.share:.0%} of its way for {longest:.0f} s; look at what holds the"
+                        " object, or state how much the surface yields"
+                    )
                 break
         settled = still is not None
         still = still or window.mean()

@@ -22,7 +22,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from tpcd.qp import compiled
+from tpcd.qp import compiled, problem
+from tpcd.simulator import path, wedge
 from tpcd.simulator.kernel_element import step_element
 from tpcd.simulator.kernel_geometry import World, new_chains
 from tpcd.simulator.kernel_request import new_planes, own_law, prepare, set_planes, set_stiffness
@@ -34,11 +35,11 @@ def source_stamp(*more: ModuleType) -> int:
     """A number for the sources of everything compiled here, and in more modules.
 
     numba's cache looks only at the file of the function it keeps, so what changes in the
-    files it calls must be part of the key, or old code would run.
+    files it calls, or takes constants from, must be part of the key, or old code would run.
     """
     digest = hashlib.sha256()
     parts = [part for name, part in sorted(sys.modules.items()) if name.startswith(__name__)]
-    for module in (*parts, compiled, *more):
+    for module in (*parts, compiled, problem, path, wedge, *more):
         digest.update(Path(str(module.__file__)).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")
 

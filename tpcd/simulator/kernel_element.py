@@ -1,5 +1,6 @@
 """One quasi-static transition in compiled loops: rest, flight to the first touch, settling, and
-the path of the command where contact changes. The same model as `settle`, `flight` and `implicit`.
+the path of the command where contact changes or turns. The same model as `settle`, `flight` and
+`implicit`.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ def step_element(
                 parts = max(parts, math.ceil(turns - ALMOST))
             if parts > 1:
                 straight, last = status, parts + 1
-        elif run == last and status > straight:
+        elif run > 1 and run == last and status > straight:
             parts, straight, last = 1, status, last + 1
         run += 1
     for a in range(3):

@@ -1,5 +1,5 @@
 """One step of a flat batch in torch, with derivatives: rest, flight, settling, and the command's
-path where contact changes. `kernel_element` is the same in compiled loops.
+path where contact changes or turns. `kernel_element` is the same in compiled loops.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def follow_path(
     stiffness: Tensor,
     settings: StepSettings,
 ) -> Transition:
-    """Step finite elements (b): rest on what was touched, go to the command, and in substeps along
-    its path where contact changes on the way."""
+    """Step finite elements (b): rest on what was touched, go to the command, and in parts along its
+    path where contact changes on the way or turns, unless the parts end worse than the whole."""
     start, stiffness, scene = start.double(), stiffness.double(), scene.double()
     command = _unwrapped(command.double(), start)
     begin = _start_state(scene, start)

@@ -54,12 +54,13 @@ class StepSettings:
     `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
     substeps: int = 2
     """Parts into which the command's path is cut where contact with floor or wall is won or
-    lost on the way, since friction then depends on the path; 1 cuts nothing, whatever else."""
+    lost on the way, since friction then depends on the path. With 1, nothing is ever cut. Where
+    the parts end worse than the whole step (see `StepStatus`), the whole one is the answer."""
     largest_turn: float = 0.05
     """Most that the command turns in one part where anything is touched [rad]: what rolls or
     slips while it turns depends on the path too."""
     follow_path: bool = False
-    """Cut every step into `substeps` parts, whether contact changes or not."""
+    """Cut every step into at least `substeps` parts, whether contact changes or not."""
     rounds: int = 20
     """Cap on re-linearisations of geometry and friction in one substep."""
     tolerance: float = 1e-7

@@ -67,27 +67,32 @@ def test_both_engines_rest_alike_under_the_previous_command():
     assert float((near & settled).double().mean()) > 0.96
 
 
-@pytest.mark.parametrize("rounds", [20, 3], ids=["settles", "often does not"])
-def test_both_engines_cut_turns_alike(rounds):
-    """Also where the parts end worse than the whole, which is then the answer."""
+def turns_in_contact(settings):
+    """Both engines on turns of 0.24 rad from rest in contact, and on the same in one part."""
     scene, start, first = many_random_transitions(40, seed=64)
     rest = simulate_step(scene, start, first, STIFFNESS, engine="native")
     turned = first + vector(0, 0, 0.24) * -first[:, 2:].sign()
-    settings = StepSettings(rounds=rounds)
-    native, reference = both(scene, rest.pose, turned, settings, previous=first)
-    whole, _ = both(scene, rest.pose, turned, replace(settings, substeps=1), previous=first)
-    parts, _ = both(scene, rest.pose, turned, replace(settings, rounds=20), previous=first)
-    alike = (native.pose - reference.pose).abs().amax(-1) < 1e-6
+    given = (scene, rest.pose, turned)
+    whole = both(*given, replace(settings, substeps=1), previous=first)
+    return both(*given, settings, previous=first), whole
+
+
+def test_both_engines_cut_turns_alike():
+    (native, reference), _ = turns_in_contact(StepSettings())
     settled = (native.status == StepStatus.CONVERGED) & (reference.status == StepStatus.CONVERGED)
-    assert float(alike[settled].double().mean()) > 0.97
-    assert float((native.status == reference.status).double().mean()) > 0.97
-    assert (native.status <= whole.status).all()
-    fell_back = (native.pose == whole.pose).all(-1) & (whole.pose != parts.pose).any(-1)
-    assert bool(fell_back.any()) == (rounds == 3)
-    for name in ANSWERS:
-        torch.testing.assert_close(
-            getattr(native, name)[fell_back], getattr(whole, name)[fell_back]
-        )
+    near = (native.pose - reference.pose).abs().amax(-1) < 1e-6
+    assert float((near & settled).double().mean()) > 0.96
+
+
+def test_where_the_parts_end_worse_the_whole_is_the_answer():
+    """With so few rounds many parts do not settle."""
+    for found, whole in zip(*turns_in_contact(StepSettings(rounds=3)), strict=True):
+        assert (found.status <= whole.status).all()
+        parted = (found.pose != whole.pose).any(-1)
+        worse = ~parted & (whole.status == StepStatus.CONVERGED)
+        assert float(worse.double().mean()) > 0.02 and float(parted.double().mean()) > 0.3
+        for name in ANSWERS:
+            torch.testing.assert_close(getattr(found, name)[worse], getattr(whole, name)[worse])
 
 
 def test_resting_under_the_same_command_moves_nothing():

@@ -24,6 +24,10 @@ from tpcd.results import format_table
 Row = dict[str, Any]
 
 
+LETTER = 0.085
+"""Width of a letter of a name in a figure [in]."""
+
+
 def report(scores: Sequence[Score], folder: Path, writer: Any) -> dict[str, list[Row]]:
     """Print all tables, log them, draw the confusion matrices; the tables by name."""
     tables = {
@@ -89,7 +93,10 @@ def confusion_figure(scores: Sequence[Score], heading: str) -> Figure:
     truths, columns, counts = confusion(scores)
     numbers = np.array(counts)
     shares = numbers / numbers.sum(1, keepdims=True)
-    width, height = 3.0 + 0.32 * len(columns), 2.2 + 0.24 * len(truths)
+    # Names need room of their own, however few there are; columns are turned by 60 degrees.
+    across, up = (max(map(len, names)) * LETTER for names in (truths, columns))
+    width = 1.0 + max(across, 0.5 * up) + 0.32 * max(len(columns), 3)
+    height = 1.2 + 0.87 * up + 0.24 * max(len(truths), 3)
     figure, (panel,) = panels(1, 1, width, height)
     panel.grid(False)
     panel.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")

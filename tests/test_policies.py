@@ -57,6 +57,20 @@ def belief(episode: Episode) -> Belief:
     return prior_belief(episode, load_prior("ycb21-z2"), generator, settings)
 
 
+def test_what_limits_draw_back_is_told(episode: Episode, belief: Belief) -> None:
+    wide = Limits(50.0, (1.0, 1.0, 1.0), (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    narrow = replace(wide, low=(-1.0, 0.06, -1.0))
+    free, drawn = (
+        MotionPolicy(lambda: press_and_slide(None), limits).choose(
+            Situation(episode.first(3), belief), torch.Generator()
+        )
+        for limits in (wide, narrow)
+    )
+    assert free.asked is None and float(free.command[1]) < 0.06
+    assert float(drawn.command[1]) == 0.06
+    torch.testing.assert_close(drawn.asked, free.command)
+
+
 def known_but(belief: Belief, name: str) -> Belief:
     """The belief with everything but one parameter known."""
     middle = belief.vectors[:1].clone()

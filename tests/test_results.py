@@ -70,6 +70,21 @@ def test_a_run_that_does_not_end_leaves_what_was_there_before(tmp_path: Path, re
     assert {path.name for path in earlier.iterdir()} == names
 
 
+def test_what_is_interrupted_says_where_it_stands_and_how_it_goes_on(tmp_path: Path) -> None:
+    def stopped(*said: str) -> str:
+        with (
+            pytest.raises(KeyboardInterrupt) as caught,
+            run_folder(tmp_path / "run", "x", {}, overwrite=True, resumable="kept") as inside,
+        ):
+            (inside / "kept").write_text("")
+            raise KeyboardInterrupt(*said)
+        return str(caught.value)
+
+    goes_on = f"{tmp_path / 'run'} goes on with --resume"
+    assert stopped() == goes_on
+    assert stopped("the arm has retreated") == f"the arm has retreated; {goes_on}"
+
+
 def test_a_run_that_ends_replaces_the_earlier_one(tmp_path: Path) -> None:
     (open_run(tmp_path / "run", "x", {}) / "old").write_text("")
     with run_folder(tmp_path / "run", "x", {}, overwrite=True) as folder:

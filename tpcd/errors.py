@@ -62,3 +62,8 @@ class SolverError(TpcdError):
 
 class RobotError(TpcdError):
     """An arm that cannot be used, or that had to be stopped."""
+
+    def __init__(self, message: str, resumable: bool = True) -> None:
+        """`resumable` says whether the run could go on from where it was."""
+        super().__init__(message)
+        self.resumable = resumable

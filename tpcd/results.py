@@ -67,7 +67,8 @@ def run_folder(
         if resumable and (folder / resumable).exists():
             shutil.rmtree(aside, ignore_errors=True)
             if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt(f"{path} goes on with --resume") from error
+                said = f"{error}; " if str(error) else ""
+                raise KeyboardInterrupt(f"{said}{path} goes on with --resume") from error
             raise
         shutil.rmtree(folder, ignore_errors=True)
         if replacing:

@@ -109,8 +109,12 @@ def explore_in_folder(
             )
         except RobotError as error:
             hint = f"; {options.out} goes on with --resume"
-            kept = (folder / resumable).is_file()
+            kept = error.resumable and (folder / resumable).is_file()
             raise RobotError(f"{error}{hint if kept else ''}") from error
+        except KeyboardInterrupt as stop:
+            on_stage.robot.stop()
+            where = getattr(on_stage.robot, "at_rest", None)
+            raise KeyboardInterrupt(*([where] if where else [])) from stop
         finally:
             try:
                 on_stage.robot.stop()
@@ -199,6 +203,13 @@ def run_exploration(
                     file=sys.stderr,
                 )
             x, z, angle = choice.command.tolist()
+            if choice.asked is not None:
+                run.bar.write(
+                    f"warning: limits drew the command of move {len(episode) - 1} back from"
+                    f" ({', '.join(f'{value:.3f}' for value in choice.asked.tolist())}) to"
+                    f" ({x:.3f}, {z:.3f}, {angle:.3f}) [m, m, rad]",
+                    file=sys.stderr,
+                )
             lead = f"u ({1e3 * x:.0f}, {1e3 * z:.0f} mm, {1e3 * angle:.0f} mrad), "
             if choice.gain is not None:
                 lead += f"gain {choice.gain:.1f}, chosen in {step.choosing_seconds:.1f} s, "

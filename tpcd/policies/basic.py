@@ -30,10 +30,16 @@ class MotionPolicy:
 
     def choose(self, situation: Situation, generator: torch.Generator) -> Choice:
         """The script's next command; after an interruption the script is run up to it."""
-        return Choice(self.next_command(situation.episode))
+        asked = self._asked_next(situation.episode)
+        command = self._drawn_back(asked, situation.episode)
+        return Choice(command, asked=None if torch.equal(command, asked) else asked)
 
     def next_command(self, episode: Episode) -> Float[Tensor, " 3"]:
-        """The command after the rows of an episode."""
+        """The command after the rows of an episode, within the limits."""
+        return self._drawn_back(self._asked_next(episode), episode)
+
+    def _asked_next(self, episode: Episode) -> Float[Tensor, " 3"]:
+        """What the script asks for after the rows of an episode."""
         rows = len(episode)
         if self._motion is None or self._asked != rows - 1:
             self._motion, self._asked = self._make(), 0
@@ -48,6 +54,9 @@ class MotionPolicy:
                 )
             )
         self._asked = rows
+        return command
+
+    def _drawn_back(self, command: Float[Tensor, " 3"], episode: Episode) -> Float[Tensor, " 3"]:
         if self._limits is None:
             return command
         return within(command, *self._limits.box(episode.poses[-1], episode.stiffness))

@@ -33,6 +33,8 @@ class Choice:
     """Commands that were compared."""
     excess_probability: float | None = None
     """Probability, in the belief, that the command exceeds the force limit."""
+    asked: Float[Tensor, " 3"] | None = None
+    """What a script asked for, where the limits drew it back [m, m, rad]."""
 
 
 @runtime_checkable

@@ -58,12 +58,11 @@ class UniversalRobot:
         said = self.settings
         frame = task_frame(tcp, said.x_axis, said.z_axis, said.origin, said.tool_zero)
         servo = self._begin(frame)
+        write_json(self._folder / FRAME_FILE, vars(frame))
         with self._watched("preflight"):
             servo.check_inside("the start pose", planar_pose(frame, tcp))
             self._std = self._check_free_air(servo)
-            first = self._first_row(servo)
-        write_json(self._folder / FRAME_FILE, vars(frame))
-        return first
+            return self._first_row(servo)
 
     def restart(self) -> Episode:
         """Leave what is touched, go back to the start pose and zero the sensor there; a new episode
@@ -127,7 +126,8 @@ class UniversalRobot:
                     f"repeating move {row} ends {1e3 * float(off[:2].max()):.1f} mm and"
                     f" {1e3 * float(off[2]):.0f} mrad from where it did, expected at most"
                     f" {1e3 * length:g} mm and {1e3 * angle:g} mrad; the object has slipped or the"
-                    " place has moved, so start a new exploration"
+                    " place has moved, so start a new exploration",
+                    resumable=False,
                 )
 
     def stop(self) -> None:
@@ -233,7 +233,7 @@ class UniversalRobot:
             self._raw.write(self._folder, name, {**about, "ended": ended})
             self.stop()
             if isinstance(error, RobotError):
-                raise RobotError(f"{error}; {self.at_rest}") from error
+                raise RobotError(f"{error}; {self.at_rest}", error.resumable) from error
             raise
         self._raw.write(self._folder, name, {**about, "ended": "done"})
 

@@ -43,11 +43,16 @@ def bench() -> Workbench:
     return Workbench(question, settings, coverage_of([episode]), 0, lambda line: None)
 
 
-def test_reported_intervals_are_wider_and_hold_the_same_place(bench: Workbench) -> None:
-    fit = fit_model(bench.question, (), range(6))  # fewer have too few draws for a width
+def test_reported_intervals_are_wider_and_hold_the_same_place(
+    bench: Workbench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Fewer seeds have too few draws for a width: with two of them it is off by a tenth.
+    monkeypatch.setattr(conclude, "SEEDS", tuple(range(40, 46)))
+    fit = fit_model(bench.question, (), range(6))
     own, told = posterior(bench.question, fit), conclude._reported(bench, fit)
     wider = (told.std() / own.std()).log().mean().exp()
-    assert 1.05 < float(wider) < 1.6  # 1 / sqrt(0.6) = 1.29
+    # 1 / sqrt(0.6) = 1.29, and less where the prior bounds or carries it: 1.11 to 1.19 here.
+    assert 1.05 < float(wider) < 1.29
     assert ((told.mean() - own.mean()).abs() < 2 * own.std()).all()
     assert told.log_evidence == fit.log_evidence
 

@@ -37,6 +37,12 @@ def robot_in(scene: Scene) -> SimulatedRobot:
     return SimulatedRobot(make_truth(scene, "quasistatic"), scene, seed=5)
 
 
+def test_a_simulated_arm_tells_its_noise(scene: Scene) -> None:
+    robot = robot_in(scene)
+    start = robot.start()
+    assert torch.equal(robot.settle(start.commands[0]).sensor_std, start.sensor_std)
+
+
 def estimator_of(kind: str) -> Estimator:
     return Estimator(
         load_prior("ycb21-z2"),

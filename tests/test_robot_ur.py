@@ -48,6 +48,7 @@ def test_moves_are_springs_and_every_reading_is_kept(emulator, tmp_path: Path) -
         touch = command(x, z - 0.05)
         reading = arm.settle(touch)
         assert reading.settled and reading.stamps is not None
+        assert torch.equal(reading.sensor_std, episode.sensor_std)
         stiffness = episode.stiffness
         torch.testing.assert_close(
             reading.wrench, stiffness * (reading.pose - touch), atol=0.08, rtol=0

@@ -22,9 +22,9 @@ class Reading:
     settled: bool = True
     """Whether the arm stood still in time."""
     sensor_std: Float[Tensor, " 6"] | None = None
-    """Standard deviation of the noise of pose and wrench, where the arm tells."""
+    """Standard deviation of the noise of pose and wrench, where it is known."""
     stamps: tuple[float, float] | None = None
-    """First and last moment of what was averaged, in the arm's own time [s]."""
+    """First and last moment of what was averaged, in the arm's own time [s]; None: no clock."""
 
 
 @runtime_checkable

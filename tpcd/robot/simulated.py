@@ -94,4 +94,5 @@ class SimulatedRobot:
     def _read(self, row: int, pose: Tensor, wrench: Tensor, settled: bool) -> Reading:
         generator = stream(self._seed, _NOISE_STREAM, row)
         noise = self._sensor_std * torch.randn(6, generator=generator, dtype=torch.float64)
-        return Reading(pose.double() + noise[:3], wrench.double() + noise[3:], settled)
+        read = (pose.double() + noise[:3], wrench.double() + noise[3:])
+        return Reading(*read, settled, self._sensor_std)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,7 @@ class UniversalRobot:
         servo.check_inside("a command", target)
         self._row += 1
         with self._watched(f"row_{self._row:03d}", command=target.tolist()):
-            return servo.settle(target)
+            return replace(servo.settle(target), sensor_std=self._std)
 
     def resume(self, episode: Episode) -> None:
         """Start, go to the earlier start pose and repeat the moves, since friction keeps the path.
@@ -109,7 +110,7 @@ class UniversalRobot:
             )
         servo = self._begin(frame)
         with self._watched("preflight_resumed"):
-            self._check_free_air(servo)
+            self._std = self._check_free_air(servo)
             first = episode.poses[0].numpy()
             over = np.array([first[0], max(first[1], planar_pose(frame, tcp)[1]), first[2]])
             servo.ramp_to(over)

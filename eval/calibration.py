@@ -244,10 +244,11 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     """Places of the true entries in their posterior, or why there are none."""
     import torch
 
-    from tpcd.belief.belief import EstimatorSettings, estimate
+    from tpcd.belief.belief import EstimatorSettings
     from tpcd.belief.cloud import SamplerSettings
-    from tpcd.belief.paper import PaperSettings, estimate_paper
+    from tpcd.belief.paper import PaperSettings
     from tpcd.belief.prior import make_prior
+    from tpcd.exploration import Estimator
 
     few = {"default": 300, "paper": 1000} if config.quick else {"default": 700, "paper": 5000}
     particles = config.particles or few[config.estimator]
@@ -257,14 +258,11 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(seed)
     try:
         vector, episode = draw_episode(make_prior(shape), settings, config.steps, generator)
-        if config.estimator == "paper":
-            paper = PaperSettings(particles=particles)
-            *_, last = estimate_paper(episode, shape, generator, paper)
-        else:
-            *_, last = estimate(episode, shape, generator, settings)
+        paper = PaperSettings(particles=particles)
+        estimator = Estimator(shape, config.estimator, settings, paper)
+        belief = estimator.learn(episode, generator).belief
     except ValueError as error:
         return {"failed": str(error)}
-    belief = last.belief
     found = torch.cat((belief.vectors, belief.misfit_sd[:, None]), dim=-1)
     if config.estimator == "paper":
         found, vector = belief.vectors, vector[:-1]

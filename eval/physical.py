@@ -100,25 +100,27 @@ def _rows(
     config: Physical, tiles: float, name: str, recorded: dict[str, Episode], folder: Path
 ) -> list[dict[str, Any]]:
     """A row of the table for each estimator: mean errors of the test's next poses and wrenches."""
-    from tpcd.belief import EstimatorSettings, estimate
-    from tpcd.belief.paper import PaperSettings, estimate_paper
+    from tpcd.belief import EstimatorSettings
+    from tpcd.belief.paper import PaperSettings
+    from tpcd.exploration import Estimator
     from tpcd.random import stream
     from tpcd.shape.checkpoint import load_prior
 
     expert, test = recorded["expert"], recorded["test"]
-    paper = estimate_paper(
-        expert, load_prior("ycb21-z2"), stream(config.seed, 7), PaperSettings(covariance=COVARIANCE)
-    )
-    ours = estimate(expert, load_prior(config.prior), stream(config.seed, 8), EstimatorSettings())
+    paper = Estimator(
+        load_prior("ycb21-z2"), "paper", paper=PaperSettings(covariance=COVARIANCE)
+    ).learn(expert, stream(config.seed, 7))
+    shape = load_prior(config.prior)
+    ours = Estimator(shape).learn(expert, stream(config.seed, 8))
     rows = [
-        _row(name, tiles, "paper's filter", list(paper)[-1].belief, test),
-        _row(name, tiles, "ours, rigid tiles", list(ours)[-1].belief, test),
+        _row(name, tiles, "paper's filter", paper.belief, test),
+        _row(name, tiles, "ours, rigid tiles", ours.belief, test),
     ]
     model, found = _found(config, recorded, folder)
     if model is not None and model.effects:
         settings = EstimatorSettings(step=model.step, effects=model.informed)
-        added = estimate(expert, load_prior(config.prior), stream(config.seed, 8), settings)
-        row = _row(name, tiles, "ours, gap found", list(added)[-1].belief, test)
+        added = Estimator(shape, settings=settings).learn(expert, stream(config.seed, 8))
+        row = _row(name, tiles, "ours, gap found", added.belief, test)
         rows.append({**row, "found": found})
     elif found:
         rows[-1]["found"] = found

@@ -152,7 +152,8 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     import torch
 
     from eval.scoring import score_tests
-    from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.belief import EstimatorSettings, SamplerSettings
+    from tpcd.exploration import Estimator
     from tpcd.predict import ContactPredictor
     from tpcd.prediction import CHANNELS
     from tpcd.shape.checkpoint import load_prior
@@ -172,17 +173,14 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     shape = load_prior(prior)
     started = time.perf_counter()
     sampler = torch.Generator().manual_seed(seed)
-    if config.estimator == "paper":
-        from tpcd.belief.paper import estimate_paper
-
-        steps = list(estimate_paper(exploration.measured, shape, sampler))
-    else:
-        settings = EstimatorSettings(
-            sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
-        )
-        steps = list(estimate(exploration.measured, shape, sampler, settings))
-    seconds = (time.perf_counter() - started) / config.steps
-    belief = steps[-1].belief
+    settings = EstimatorSettings(
+        sampler=SamplerSettings(particles=config.particles), misfit_sd=config.misfit
+    )
+    estimator = Estimator(shape, config.estimator, settings)  # type: ignore[arg-type]
+    *_, last = estimator.steps(exploration.measured, sampler)
+    seconds = time.perf_counter() - started
+    closed = estimator.closing_step(exploration.measured, last.state) or last
+    belief = closed.belief
     error, transform, touching = score_tests(ContactPredictor(belief), tests)
     inside = ((transform > 0.05) & (transform < 0.95)).double()
     truth_vector = torch.tensor(list(scene.theta.values()), dtype=torch.float64)
@@ -201,7 +199,9 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     row["worst_mm"] = float(error[:, :2].max()) * 1e3
     row["coverage_90"] = float(inside.mean())
     row["coverage_contact"] = float(inside[touching].mean())
-    row["s_per_step"] = seconds
+    row["s_per_step"] = seconds / config.steps
+    row["s_closing"] = closed.seconds
+    row["ess"] = closed.info.effective_sample_size
     row["transform"] = transform.tolist()
     row["theta_score"] = score.tolist()
     return row

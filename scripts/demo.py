@@ -100,9 +100,16 @@ def explore_and_test(config: Demo, folder: Path) -> None:
         write_recording(robot.recording(episode), scene, path, overwrite=True)
 
     started = time.perf_counter()
-    steps = explore(robot, ActivePolicy(Limits()), Estimator(shape), config.seed, on_row=save)
-    known = KnownTruth(scene.vertices_ee, scene.theta)
-    belief, *_ = run_exploration(steps, Stopping(config.steps), config.prior, folder, truth=known)
+    estimator = Estimator(shape)
+    steps = explore(robot, ActivePolicy(Limits()), estimator, config.seed, on_row=save)
+    belief, *_ = run_exploration(
+        steps,
+        Stopping(config.steps),
+        config.prior,
+        folder,
+        truth=KnownTruth(scene.vertices_ee, scene.theta),
+        closing=estimator.closing_step,
+    )
     seconds = (time.perf_counter() - started) / config.steps
 
     predictor = ContactPredictor(belief)

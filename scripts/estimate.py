@@ -48,13 +48,14 @@ def estimate_episode(config: Estimate) -> None:
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
-    from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.belief import EstimatorSettings, SamplerSettings
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
     from tpcd.commands.plausibility import check_start_pose
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
+    from tpcd.exploration import Estimator
     from tpcd.results import continue_run, format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
@@ -78,21 +79,17 @@ def estimate_episode(config: Estimate) -> None:
     with opened as folder:
         keep_model(model, folder, config.model)
         state = load_state(folder, episode)
-        done = 0 if state is None else state.index
-        generator = torch.Generator().manual_seed(config.seed)
-        if config.estimator == "paper":
-            from tpcd.belief.paper import estimate_paper
-
-            steps = estimate_paper(episode, shape, generator, state=state)
-        else:
-            settings = EstimatorSettings(
-                sampler=SamplerSettings(particles=config.particles),
-                step=model.step,
-                misfit_sd=config.misfit,
-                effects=model.informed,
-            )
-            steps = estimate(episode, shape, generator, settings, state)
-        belief = run_estimation(steps, episode, config.prior, folder, done=done)
+        settings = EstimatorSettings(
+            sampler=SamplerSettings(particles=config.particles),
+            step=model.step,
+            misfit_sd=config.misfit,
+            effects=model.informed,
+        )
+        estimator = Estimator(shape, config.estimator, settings)
+        steps = estimator.steps(episode, torch.Generator().manual_seed(config.seed), state)
+        belief = run_estimation(
+            steps, episode, config.prior, folder, state=state, closing=estimator.closing_step
+        )
         table = parameter_rows(belief)
         text = format_table(table)
         print(text)

@@ -71,7 +71,7 @@ def test_a_stopped_estimation_goes_on_to_the_same_belief(
     state = load_state(folder, episode)
     assert state is not None and state.index == 2
     again = run_estimation(
-        steps(kind, episode, state), episode, PRIOR, folder, show_progress=False, done=2
+        steps(kind, episode, state), episode, PRIOR, folder, show_progress=False, state=state
     )
     torch.testing.assert_close(again.vectors, whole.vectors, rtol=0, atol=0)
     torch.testing.assert_close(again.weights, whole.weights, rtol=0, atol=0)

@@ -13,7 +13,14 @@ from typing import Literal
 
 import torch
 
-from tpcd.belief.belief import Belief, EstimationStep, EstimatorSettings, estimate, prior_belief
+from tpcd.belief.belief import (
+    Belief,
+    EstimationStep,
+    EstimatorSettings,
+    estimate,
+    prior_belief,
+    refine,
+)
 from tpcd.belief.paper import PaperSettings, estimate_paper, paper_prior_belief
 from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
@@ -54,6 +61,18 @@ class Estimator:
         if self.kind == "paper":
             return estimate_paper(episode, self.shape, generator, self.paper, state)
         return estimate(episode, self.shape, generator, self.settings, state)
+
+    def closing_step(self, episode: Episode, state: EstimatorState) -> EstimationStep | None:
+        """The belief at the end of an episode from many more draws; None with the paper's filter,
+        whose particles are what they are."""
+        if self.kind == "paper":
+            return None
+        return refine(episode, self.shape, state, self.settings)
+
+    def learn(self, episode: Episode, generator: torch.Generator) -> EstimationStep:
+        """The belief after a whole episode."""
+        *_, last = self.steps(episode, generator)
+        return self.closing_step(episode, last.state) or last
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,10 @@ def run_cell(
         choosing += step.choosing_seconds
         moves = len(step.episode) - 1
         if moves in CHECKPOINTS or moves == steps:
-            belief = step.estimation.belief
+            closed = None
+            if moves == steps:
+                closed = estimator.closing_step(step.episode, step.estimation.state)
+            belief = (closed or step.estimation).belief
             found = _test(top_particles(belief, TOP) if cell.estimator == "paper" else belief,
                           recordings)  # fmt: skip
             row["moves"].append(moves)
@@ -99,6 +102,7 @@ def run_cell(
     row["largest_force"] = float(step.episode.wrenches[:, :2].abs().max())
     row["choosing_s"] = choosing / steps
     row["learning_s"] = sum(one.seconds for one in learnt) / steps
+    row["closing_s"] = 0.0 if closed is None else closed.seconds
     row["seconds"] = time.perf_counter() - started
     return Outcome(row, scene, learnt, robot.recording(step.episode), recordings[0])
 

@@ -1,6 +1,6 @@
 """The belief over theta: likelihood, resampling, samplers, and the paper's filter."""
 
-from tpcd.belief.belief import Belief, EstimationStep, EstimatorSettings, estimate
+from tpcd.belief.belief import Belief, EstimationStep, EstimatorSettings, estimate, refine
 from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.prior import ParameterPrior, make_prior
 
@@ -12,4 +12,5 @@ __all__ = [
     "SamplerSettings",
     "estimate",
     "make_prior",
+    "refine",
 ]

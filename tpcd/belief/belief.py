@@ -1,8 +1,9 @@
 """The belief over theta: estimated from an episode, held by users, saved and loaded.
 
 `estimate` brings in the transitions of an episode one by one and yields the belief after
-each. A belief holds weighted particles of theta and, for each particle, the normal
-posterior of the outline misfit; it is all that prediction needs besides the shape model.
+each; `refine` gives the last one many more draws. A belief holds weighted particles of theta
+and, for each particle, the normal posterior of the outline misfit; it is all that prediction
+needs besides the shape model.
 """
 
 from __future__ import annotations
@@ -65,6 +66,18 @@ class EstimatorSettings:
         """Of the sampler, for the model with its effects."""
         more = self.effect_draws if self.effects else 1
         return replace(self.sampler, draws=more * self.sampler.draws)
+
+    @property
+    def closing_budget(self) -> SamplerSettings:
+        """Of the sampler once all data are in."""
+        budget, times = self.budget, self.sampler.closing
+        return replace(
+            budget,
+            places=times * budget.places,
+            draws=times * budget.draws,
+            modes=times * budget.modes,
+            fresh_modes=times * budget.fresh_modes,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +146,8 @@ def estimate(
     explain a transition.
     """
     settings = settings or EstimatorSettings()
-    prior = make_prior(shape, episode.priors, settings.effects)
     history = history_of(episode)
-    misfit = misfit_field(shape, settings)
-    target = ContactTarget(prior, misfit, settings.step)
+    target = _target(episode, shape, settings)
     if state is None:
         cloud = start_cloud(target.sample(settings.sampler.particles, generator))
     else:
@@ -151,6 +162,33 @@ def estimate(
         yield EstimationStep(k, belief, info, seconds, after)
 
 
+def refine(
+    episode: Episode,
+    shape: Shape,
+    state: EstimatorState,
+    settings: EstimatorSettings | None = None,
+) -> EstimationStep:
+    """The belief that `state` holds, found once more with many more draws.
+
+    After each transition the sampler spends little; what it found then is where
+    `settings.closing_budget` begins. The state stays as it is, and the same state gives
+    the same belief. Raises ValueError where no particle can explain the episode.
+    """
+    settings = settings or EstimatorSettings()
+    started = time.perf_counter()
+    generator = torch.Generator()
+    cloud = cloud_from_tensors(state.restore(generator))
+    target = _target(episode, shape, settings).given(history_of(episode).first(state.index))
+    cloud, info = assimilate(cloud, target, state.index, settings.closing_budget, generator)
+    belief = belief_of(cloud, target)
+    return EstimationStep(state.index, belief, info, time.perf_counter() - started, state)
+
+
+def _target(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
+    prior = make_prior(shape, episode.priors, settings.effects)
+    return ContactTarget(prior, misfit_field(shape, settings), settings.step)
+
+
 def prior_belief(
     episode: Episode,
     shape: Shape,
@@ -162,9 +200,8 @@ def prior_belief(
     Where none does, all of them.
     """
     settings = settings or EstimatorSettings()
-    prior = make_prior(shape, episode.priors, settings.effects)
-    misfit = misfit_field(shape, settings)
-    target = ContactTarget(prior, misfit, settings.step)
+    target = _target(episode, shape, settings)
+    prior, misfit = target.prior, target.misfit
     score = target.sample(settings.sampler.particles, generator)
     vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
     scene = scene_from_parameters(shape, prior.parameters_of(vectors)).double()

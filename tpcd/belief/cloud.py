@@ -63,6 +63,8 @@ class SamplerSettings:
     """Newton steps before the lower half of those gives up."""
     following_rounds: int = 3
     """Newton steps of the modes that are remembered, and of those that did not give up."""
+    closing: int = 4
+    """Times as many places, modes and draws once no more data are to come (see `refine`)."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
@@ -77,6 +79,7 @@ class SamplerSettings:
             "fresh_modes": 1,
             "climbing_rounds": 0,
             "following_rounds": 0,
+            "closing": 1,
         }
         for name, limit in least.items():
             if not getattr(self, name) >= limit:

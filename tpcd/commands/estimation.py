@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,18 +18,21 @@ from typing import Any
 from tqdm import tqdm
 
 from tpcd.belief.belief import Belief, EstimationStep
-from tpcd.belief.state import save_state
+from tpcd.belief.state import EstimatorState, save_state
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
 from tpcd.commands.summary import prior_summary, summarise
 from tpcd.data.episode import Episode
-from tpcd.files import write_json
+from tpcd.files import write_json, write_text
 
 STEPS_FILE = "steps.jsonl"
 FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
+
+Closing = Callable[[Episode, EstimatorState], EstimationStep | None]
+"""Finds the belief at the end of an episode from many more draws; None where that is not done."""
 
 
 def run_estimation(
@@ -39,14 +42,15 @@ def run_estimation(
     folder: Path,
     truth: KnownTruth | None = None,
     show_progress: bool = True,
-    done: int = 0,
+    state: EstimatorState | None = None,
+    closing: Closing | None = None,
 ) -> Belief:
     """Draw the steps of an estimator to their end, saving as it goes; returns the belief.
 
-    `done` steps of an earlier run in the folder are kept, and `steps` come after them.
+    The steps up to the `state` of an earlier run in the folder are kept, and `steps` come after.
     """
     total = len(episode) - 1
-    with EstimationRun(folder, prior_name, total, done, show_progress) as run:
+    with EstimationRun(folder, prior_name, total, state, show_progress, closing) as run:
         for step in steps:
             run.add(step, episode)
         return run.finish(episode, truth)
@@ -56,10 +60,17 @@ class EstimationRun:
     """A run folder that is written step by step, while a progress bar tells how it goes."""
 
     def __init__(
-        self, folder: Path, prior_name: str, total: int, done: int = 0, show_progress: bool = True
+        self,
+        folder: Path,
+        prior_name: str,
+        total: int,
+        state: EstimatorState | None = None,
+        show_progress: bool = True,
+        closing: Closing | None = None,
     ) -> None:
-        """`done` steps of an earlier run in the folder are kept."""
-        self.folder = folder
+        """The steps up to the `state` of an earlier run in the folder are kept."""
+        done = 0 if state is None else state.index
+        self.folder, self.state, self._closing = folder, state, closing
         self.history = _earlier_rows(folder / STEPS_FILE, done)
         self.belief = load_belief(folder) if done else None
         self._prior_name, self._done = prior_name, done
@@ -91,7 +102,7 @@ class EstimationRun:
         """Save a step. `further` goes into its line of `steps.jsonl` and, where it is a number, to
         TensorBoard; `lead` is shown first in the progress bar."""
         learnt = _learnt_most(self.belief, step.belief)
-        self.belief = step.belief
+        self.belief, self.state = step.belief, step.state
         row = {**step_row(step, learnt), **(further or {})}
         self.history.append(row)
         self._lines.write(json.dumps(row) + "\n")
@@ -109,9 +120,12 @@ class EstimationRun:
         self.bar.update()
 
     def finish(self, episode: Episode, truth: KnownTruth | None = None) -> Belief:
-        """Write the summary and the figures; returns the belief."""
-        if self.belief is None:
+        """Close the estimation, write the summary and the figures; returns the belief."""
+        if self.belief is None or self.state is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
+        if self._closing is not None:
+            self.bar.set_postfix_str("all data are in; many more draws of the belief")
+            self._replace_last(self._closing(episode, self.state))
         write_json(self.folder / "summary.json", summarise(self.belief))
         warning = few_draws_warning(self.history[-1])
         if warning is not None:
@@ -119,6 +133,19 @@ class EstimationRun:
         figures = self.folder / "figures"
         draw_estimation(self.belief, self.history, episode, figures, self.writer, truth)
         return self.belief
+
+    def _replace_last(self, step: EstimationStep | None) -> None:
+        """Save a step in place of the last one; the state is that of both."""
+        if step is None:
+            return
+        self.belief = step.belief
+        last = self.history[-1]
+        row = {**step_row(step, last["learnt_most"]), "closing_seconds": step.seconds}
+        self.history[-1] = {**last, **row, "seconds": last["seconds"]}
+        lines = "".join(json.dumps(row) + "\n" for row in self.history)
+        write_text(self.folder / STEPS_FILE, lines)
+        save_belief(step.belief, self.folder, self._prior_name)
+        _log_scalars(self.writer, self.history[-1], step)
 
 
 def few_draws_warning(row: dict[str, Any]) -> str | None:

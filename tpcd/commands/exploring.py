@@ -10,10 +10,10 @@ from pathlib import Path
 
 from tpcd.belief import EstimatorSettings
 from tpcd.belief.belief import Belief
-from tpcd.belief.state import load_state
+from tpcd.belief.state import EstimatorState, load_state
 from tpcd.belief.storage import load_belief
 from tpcd.commands.drawing import KnownTruth
-from tpcd.commands.estimation import EstimationRun
+from tpcd.commands.estimation import Closing, EstimationRun
 from tpcd.commands.exploring_options import ExploringOptions
 from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
 from tpcd.commands.summary import parameter_rows
@@ -85,10 +85,11 @@ def explore_in_folder(
             raise ValueError(f"{options.out} has all of its {options.steps} moves; raise --steps")
         on_stage = stage(folder, limits, task)
         settings = EstimatorSettings(step=model.step, effects=model.informed)
+        estimator = Estimator(shape, options.estimator, settings)
         steps = explore(
             on_stage.robot,
             on_stage.policy,
-            Estimator(shape, options.estimator, settings),
+            estimator,
             options.seed,
             episode,
             belief,
@@ -105,7 +106,8 @@ def explore_in_folder(
                 episode,
                 task,
                 on_stage.truth,
-                done,
+                state,
+                estimator.closing_step,
             )
         except RobotError as error:
             hint = f"; {options.out} goes on with --resume"
@@ -184,16 +186,18 @@ def run_exploration(
     episode: Episode | None = None,
     task: Task | None = None,
     truth: KnownTruth | None = None,
-    done: int = 0,
+    state: EstimatorState | None = None,
+    closing: Closing | None = None,
     show_progress: bool = True,
 ) -> tuple[Belief, Episode, str]:
     """Explore until it is enough, saving as it goes; returns belief, episode and why it ended.
 
-    `done` steps of an earlier run in the folder, with the rows `episode`, are kept, and `steps`
-    come after them; where they are all that was asked for, only what ends a run is missing.
+    The steps up to the `state` of an earlier run in the folder, with the rows `episode`, are
+    kept, and `steps` come after them; where they are all that was asked for, only what ends a
+    run is missing.
     """
-    with EstimationRun(folder, prior_name, stopping.steps, done, show_progress) as run:
-        if episode is not None and done >= stopping.steps:
+    with EstimationRun(folder, prior_name, stopping.steps, state, show_progress, closing) as run:
+        if episode is not None and state is not None and state.index >= stopping.steps:
             return run.finish(episode, truth), episode, f"all {stopping.steps} moves are made"
         for step in steps:
             choice, episode = step.choice, step.episode

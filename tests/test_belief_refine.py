@@ -1,0 +1,124 @@
+"""The last belief of an episode, found once more with many more draws."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from linear_model import DIMENSION, LinearModel
+
+from tpcd.belief import EstimatorSettings, SamplerSettings, refine
+from tpcd.belief.belief import EstimationStep
+from tpcd.belief.cloud import start_cloud
+from tpcd.belief.importance import assimilate
+from tpcd.belief.state import load_state
+from tpcd.belief.storage import load_belief
+from tpcd.commands.estimation import run_estimation
+from tpcd.data.episode import Episode
+from tpcd.exploration import Estimator
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+PRIOR, STEPS = "ycb21-z2", 4
+SETTINGS = EstimatorSettings(sampler=SamplerSettings(particles=64, draws=600, closing=5))
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    generator = torch.Generator().manual_seed(3)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    motion = make_motion("rich", scene, STEPS, generator)
+    return record(make_truth(scene, "quasistatic"), scene, motion, STEPS, generator).measured
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    return Estimator(load_prior(PRIOR), settings=SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def steps(episode: Episode, estimator: Estimator) -> list[EstimationStep]:
+    return list(estimator.steps(episode, torch.Generator().manual_seed(0)))
+
+
+def test_the_same_data_again_count_once() -> None:
+    model, settings = LinearModel(4), SamplerSettings(particles=2000, draws=6000)
+    generator = torch.Generator().manual_seed(2)
+    normal = torch.randn(500, DIMENSION, generator=generator, dtype=torch.float64)
+    cloud = start_cloud(normal)
+    for _ in range(3):
+        cloud, _ = assimilate(cloud, model.target(4), 4, settings, generator)
+    mean, covariance, log_evidence = model.posterior(4)
+    std = covariance.diagonal().sqrt()
+    assert ((cloud.weights @ cloud.positions - mean).abs() / std).max() < 0.1
+    found = (cloud.weights @ (cloud.positions - mean) ** 2).sqrt()
+    torch.testing.assert_close(found, std, rtol=0.08, atol=0)
+    assert abs(cloud.log_evidence - log_evidence) < 4 * cloud.log_evidence_std
+
+
+def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep]
+) -> None:
+    last = steps[-1]
+    before = {name: value.clone() for name, value in last.state.tensors.items()}
+    closed = refine(episode, estimator.shape, last.state, SETTINGS)
+    again = refine(episode, estimator.shape, last.state, SETTINGS)
+    assert last.info.draws == 600 and closed.info.draws == 3000
+    assert closed.info.evaluations > 2 * last.info.evaluations
+    assert torch.equal(closed.belief.vectors, again.belief.vectors)
+    assert torch.equal(closed.belief.weights, again.belief.weights)
+    assert not torch.equal(closed.belief.vectors, last.belief.vectors)
+    assert closed.index == STEPS and closed.state is last.state
+    for name, value in before.items():
+        assert torch.equal(last.state.tensors[name], value)
+    whole = estimator.learn(episode, torch.Generator().manual_seed(0))
+    assert torch.equal(whole.belief.vectors, closed.belief.vectors)
+
+
+def test_the_middle_of_an_episode_is_refined_from_its_own_data(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep]
+) -> None:
+    two = refine(episode.first(3), estimator.shape, steps[1].state, SETTINGS).belief
+    cut = refine(episode, estimator.shape, steps[1].state, SETTINGS).belief
+    assert torch.equal(two.vectors, cut.vectors)
+
+
+def test_the_papers_filter_is_left_as_it_is(episode: Episode, estimator: Estimator) -> None:
+    paper = Estimator(estimator.shape, "paper")
+    *_, last = paper.steps(episode, torch.Generator().manual_seed(0))
+    assert paper.closing_step(episode, last.state) is None
+    whole = paper.learn(episode, torch.Generator().manual_seed(0))
+    assert torch.equal(whole.belief.vectors, last.belief.vectors)
+
+
+def test_a_run_ends_with_the_closing_draws_and_one_stopped_during_them_does_too(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep], tmp_path: Path
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        run_estimation(iter(steps), episode, PRIOR, folder, show_progress=False, closing=stop)
+    assert not (folder / "summary.json").exists()
+    torch.testing.assert_close(load_belief(folder).vectors, steps[-1].belief.vectors)
+    found = run_estimation(
+        iter(()),
+        episode,
+        PRIOR,
+        folder,
+        show_progress=False,
+        state=load_state(folder, episode),
+        closing=estimator.closing_step,
+    )
+    expected = refine(episode, estimator.shape, steps[-1].state, SETTINGS)
+    assert torch.equal(found.vectors, expected.belief.vectors)
+    assert torch.equal(load_belief(folder).vectors, found.vectors)
+    rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert rows[-1]["effective_sample_size"] == expected.info.effective_sample_size
+    assert rows[-1]["closing_seconds"] > 0 and "closing_seconds" not in rows[-2]

@@ -179,7 +179,8 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     estimator = Estimator(shape, config.estimator, settings)  # type: ignore[arg-type]
     *_, last = estimator.steps(exploration.measured, sampler)
     seconds = time.perf_counter() - started
-    closed = estimator.closing_step(exploration.measured, last.state) or last
+    closing = estimator.closing
+    closed = last if closing is None else closing(exploration.measured, last.state)
     belief = closed.belief
     error, transform, touching = score_tests(ContactPredictor(belief), tests)
     inside = ((transform > 0.05) & (transform < 0.95)).double()
@@ -200,7 +201,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     row["coverage_90"] = float(inside.mean())
     row["coverage_contact"] = float(inside[touching].mean())
     row["s_per_step"] = seconds / config.steps
-    row["s_closing"] = closed.seconds
+    row["s_closing"] = 0.0 if closing is None else closed.seconds
     row["ess"] = closed.info.effective_sample_size
     row["transform"] = transform.tolist()
     row["theta_score"] = score.tolist()

@@ -57,7 +57,8 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
     from tpcd.commands.drawing import KnownTruth
-    from tpcd.commands.exploring import EPISODE_NAME, Stopping, run_exploration
+    from tpcd.commands.exploration_run import Stopping, run_exploration
+    from tpcd.commands.exploring import EPISODE_NAME
     from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
@@ -108,7 +109,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
         config.prior,
         folder,
         truth=KnownTruth(scene.vertices_ee, scene.theta),
-        closing=estimator.closing_step,
+        closing=estimator.closing,
     )
     seconds = (time.perf_counter() - started) / config.steps
 
@@ -143,7 +144,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     write_results(folder, table, seeds=[config.seed], seconds_per_step=seconds)
     print(f"\nerror against the truth on {config.tests} x {config.test_steps} held-out steps:")
     print(text)
-    print(f"choosing a move, making it and learning from it took {seconds:.2f} s per step")
+    print(f"choosing moves, making them and learning from them took {seconds:.2f} s per step")
     print(
         f"\nresults in {folder}; figures in {folder / 'figures'}\n"
         f"next:  tensorboard --logdir {folder}\n"

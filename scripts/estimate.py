@@ -88,7 +88,7 @@ def estimate_episode(config: Estimate) -> None:
         estimator = Estimator(shape, config.estimator, settings)
         steps = estimator.steps(episode, torch.Generator().manual_seed(config.seed), state)
         belief = run_estimation(
-            steps, episode, config.prior, folder, state=state, closing=estimator.closing_step
+            steps, episode, config.prior, folder, state=state, closing=estimator.closing
         )
         table = parameter_rows(belief)
         text = format_table(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from tpcd.belief.state import load_state
 from tpcd.belief.storage import load_belief
 from tpcd.commands.estimation import run_estimation
 from tpcd.data.episode import Episode
+from tpcd.effects import find_effect
 from tpcd.exploration import Estimator
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
@@ -60,6 +62,14 @@ def test_the_same_data_again_count_once() -> None:
     assert abs(cloud.log_evidence - log_evidence) < 4 * cloud.log_evidence_std
 
 
+def test_the_closing_budget_multiplies_all_that_finds_places() -> None:
+    given = SamplerSettings(places=7, draws=110, modes=3, fresh_modes=11, closing=5)
+    wanted = replace(given, places=35, draws=550, modes=15, fresh_modes=55)
+    assert EstimatorSettings(sampler=given).closing_budget == wanted
+    effect = EstimatorSettings(sampler=given, effects=(find_effect("adhesion"),))
+    assert effect.closing_budget == replace(wanted, draws=1650)
+
+
 def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(
     episode: Episode, estimator: Estimator, steps: list[EstimationStep]
 ) -> None:
@@ -68,7 +78,6 @@ def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(
     closed = refine(episode, estimator.shape, last.state, SETTINGS)
     again = refine(episode, estimator.shape, last.state, SETTINGS)
     assert last.info.draws == 600 and closed.info.draws == 3000
-    assert closed.info.evaluations > 2 * last.info.evaluations
     assert torch.equal(closed.belief.vectors, again.belief.vectors)
     assert torch.equal(closed.belief.weights, again.belief.weights)
     assert not torch.equal(closed.belief.vectors, last.belief.vectors)
@@ -90,7 +99,7 @@ def test_the_middle_of_an_episode_is_refined_from_its_own_data(
 def test_the_papers_filter_is_left_as_it_is(episode: Episode, estimator: Estimator) -> None:
     paper = Estimator(estimator.shape, "paper")
     *_, last = paper.steps(episode, torch.Generator().manual_seed(0))
-    assert paper.closing_step(episode, last.state) is None
+    assert paper.closing is None
     whole = paper.learn(episode, torch.Generator().manual_seed(0))
     assert torch.equal(whole.belief.vectors, last.belief.vectors)
 
@@ -113,12 +122,37 @@ def test_a_run_ends_with_the_closing_draws_and_one_stopped_during_them_does_too(
         folder,
         show_progress=False,
         state=load_state(folder, episode),
-        closing=estimator.closing_step,
+        closing=estimator.closing,
     )
     expected = refine(episode, estimator.shape, steps[-1].state, SETTINGS)
     assert torch.equal(found.vectors, expected.belief.vectors)
     assert torch.equal(load_belief(folder).vectors, found.vectors)
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
-    assert rows[-1]["effective_sample_size"] == expected.info.effective_sample_size
-    assert rows[-1]["closing_seconds"] > 0 and "closing_seconds" not in rows[-2]
+    assert rows[-1]["closed"]["effective_sample_size"] == expected.info.effective_sample_size
+    assert rows[-1]["effective_sample_size"] == steps[-1].info.effective_sample_size
+    assert "closed" not in rows[-2]
+
+
+def test_where_the_closing_draws_explain_nothing_the_belief_stays(
+    episode: Episode, steps: list[EstimationStep], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    def nothing(*_: object) -> EstimationStep:
+        raise ValueError("no particle explains")
+
+    found = run_estimation(
+        iter(steps), episode, PRIOR, tmp_path, show_progress=False, closing=nothing
+    )
+    assert torch.equal(found.vectors, steps[-1].belief.vectors)
+    assert "as it was: no particle explains" in capsys.readouterr().err
+    assert (tmp_path / "summary.json").is_file()
+
+
+def test_a_state_gives_back_the_belief_that_left_it(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep]
+) -> None:
+    held = estimator.held(episode, steps[1].state)
+    assert held is not None
+    for name in ("vectors", "weights", "misfit_sd", "misfit_mean", "misfit_covariance"):
+        assert torch.equal(getattr(held, name), getattr(steps[1].belief, name))
+    assert Estimator(estimator.shape, "paper").held(episode, steps[1].state) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,16 @@ import torch
 from command_calls import PRIOR, call
 
 from tpcd.belief import EstimatorSettings, SamplerSettings
+from tpcd.belief.belief import EstimationStep
 from tpcd.belief.paper import PaperSettings
-from tpcd.commands.exploring import Stopping
+from tpcd.belief.state import EstimatorState
+from tpcd.belief.storage import load_belief
+from tpcd.commands.estimation import EstimationRun
+from tpcd.commands.exploration_run import Kept, Stopping, expected_error, run_exploration
 from tpcd.data.episode import Episode, read_episode
 from tpcd.exploration import Estimator, ExplorationStep, explore
 from tpcd.policies import ActivePolicy, ActiveSettings, Limits, Policy, make_policy
+from tpcd.policies.active import Task
 from tpcd.robot.protocol import Robot
 from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
@@ -142,8 +148,9 @@ def test_it_stops_before_a_move_that_promises_too_little(scene: Scene) -> None:
     least = 1.1 * first.choice.gain
     assert list(explore(robot, policy, estimator, 4, least_gain=least)) == []
     assert len(robot.recording(robot.start()).true) == 1
-    assert Stopping(steps=5).reason(first, None) is None
-    assert Stopping(steps=1).reason(first, None) == "all 1 moves are made"
+    belief = first.estimation.belief
+    assert Stopping(steps=5).reason(belief, 1, None) is None
+    assert Stopping(steps=1).reason(belief, 1, None) == "all 1 moves are made"
 
 
 ARGUMENTS = ("--outline", "soup_can", "--prior", PRIOR, "--truth", "quasistatic")
@@ -157,6 +164,7 @@ def test_the_command_explores_stops_and_goes_on(
     assert "all 2 moves are made" in capsys.readouterr().err
     rows = [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
     assert len(rows) == 2 and rows[0]["gain"] > 0
+    assert ["closed" in row for row in rows] == [False, True]
     episode = read_episode(out / "explore.csv")
     assert len(episode) == 3
     true, _ = read_truth(out / "explore.csv")
@@ -177,7 +185,13 @@ def test_the_command_explores_stops_and_goes_on(
     assert call("explore", *ARGUMENTS, "--steps", "3", "--out", str(out), "--resume") == 0
     longer: Episode = read_episode(out / "explore.csv")
     torch.testing.assert_close(longer.poses[:3], episode.poses)
-    assert len((out / "steps.jsonl").read_text().splitlines()) == 3
+    rows = [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+    assert ["closed" in row for row in rows] == [False, False, True]
+    # And comes to what one without a stop comes to.
+    whole = tmp_path / "whole"
+    assert call("explore", *ARGUMENTS, "--steps", "3", "--out", str(whole)) == 0
+    assert torch.equal(read_episode(whole / "explore.csv").commands, longer.commands)
+    assert torch.equal(load_belief(whole).vectors, load_belief(out).vectors)
     assert json.loads((out / "results.json").read_text())["config"]["steps"] == 3
 
 
@@ -201,3 +215,50 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
     message = capsys.readouterr().err.strip()
     assert said in message and message.count("\n") == 0
     assert not out.exists()
+
+
+def test_the_arm_lets_go_before_the_closing_draws(scene: Scene, tmp_path: Path) -> None:
+    estimator, robot = estimator_of("default"), robot_in(scene)
+    order: list[str] = []
+
+    def closing(episode: Episode, state: EstimatorState) -> EstimationStep:
+        order.append(f"closed after {len(episode) - 1}")
+        assert estimator.closing is not None
+        return estimator.closing(episode, state)
+
+    steps = explore(robot, policy_of("random", scene), estimator, 4)
+    belief, episode, _ = run_exploration(
+        steps,
+        Stopping(2),
+        PRIOR,
+        tmp_path,
+        closing=closing,
+        let_go=lambda: order.append("let go"),
+        show_progress=False,
+    )
+    assert order == ["let go", "closed after 2"] and len(episode) == 3
+    assert torch.equal(load_belief(tmp_path).vectors, belief.vectors)
+
+
+def test_what_was_enough_before_a_stop_needs_no_further_move(scene: Scene, tmp_path: Path) -> None:
+    estimator = estimator_of("default")
+    (step,) = first_steps(1, explore(robot_in(scene), policy_of("random", scene), estimator, 4))
+    episode, state = step.episode, step.estimation.state
+    task = Task(episode.poses[:1], episode.commands[1:], episode.commands[:1])
+    error = expected_error(step.estimation.belief, task)
+
+    def moves() -> Iterator[ExplorationStep]:
+        raise AssertionError("no move was needed")
+        yield
+
+    with EstimationRun(tmp_path, PRIOR, 5, show_progress=False) as run:
+        run.add(step.estimation, episode)
+    kept = Kept(episode, step.estimation.belief, state)
+    *_, reason = run_exploration(
+        moves(), Stopping(5, 1.01 * error), PRIOR, tmp_path, kept, task, show_progress=False
+    )
+    assert reason.startswith(f"the task's poses are expected within {1e3 * error:.2f} mm")
+    with pytest.raises(AssertionError, match="no move was needed"):
+        run_exploration(
+            moves(), Stopping(5, 0.99 * error), PRIOR, tmp_path, kept, task, show_progress=False
+        )

@@ -28,6 +28,7 @@ def cell(name: str, seed: int, policy: str, error: float) -> Row:
         "moves": [1, 2], "mae": [[10 * error] * 6, [error] * 6], "sd": [[0.0] * 6, [error] * 6],
         "peak_wrench": [10 * error] * 3, "coverage_50": [0.1, 0.5], "coverage_90": [0.2, 0.9],
         "contact_90": [0.3, 0.8], "choosing_s": 1.0, "learning_s": 2.0, "transform": [[0.5] * 6],
+        "open_mae": [[10 * error] * 6, [2 * error] * 6], "closing_s": 3.0,
     }  # fmt: skip
 
 
@@ -76,7 +77,7 @@ def test_an_unknown_object_is_refused_before_anything_is_made(tmp_path: Path) ->
 def test_curves_follow_the_moves() -> None:
     moves, errors = curves(CELLS, "mujoco")["default / random"]
     assert moves.tolist() == [1, 2]
-    np.testing.assert_allclose(errors, [80.0, 8.0])
+    np.testing.assert_allclose(errors, [80.0, 16.0])
 
 
 def test_bootstrap_draws_whole_objects() -> None:
@@ -137,7 +138,7 @@ def test_the_quick_table_scores_every_cell_and_goes_on_after_a_stop(tmp_path: Pa
     make_table(replace(config, resume=True))
     again = json.loads((config.out / "results.json").read_text())
     for before, after in zip(results["table"], again["table"], strict=True):
-        timed = ("choosing_s", "learning_s")
+        timed = ("choosing_s", "learning_s", "closing_s")
         assert {k: v for k, v in before.items() if k not in timed} == {
             k: v for k, v in after.items() if k not in timed
         }

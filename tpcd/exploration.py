@@ -19,9 +19,9 @@ from tpcd.belief.belief import (
     EstimatorSettings,
     estimate,
     prior_belief,
-    refine,
 )
 from tpcd.belief.paper import PaperSettings, estimate_paper, paper_prior_belief
+from tpcd.belief.refinement import held_belief, refine
 from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
 from tpcd.policies.protocol import Choice, Policy, Situation
@@ -30,6 +30,9 @@ from tpcd.robot.protocol import Robot
 from tpcd.shape.protocol import Shape
 
 _POLICY_STREAM, _PRIOR_STREAM = 1, 2
+
+Closing = Callable[[Episode, EstimatorState], EstimationStep]
+"""Finds the belief that a state holds from many more draws."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +65,25 @@ class Estimator:
             return estimate_paper(episode, self.shape, generator, self.paper, state)
         return estimate(episode, self.shape, generator, self.settings, state)
 
-    def closing_step(self, episode: Episode, state: EstimatorState) -> EstimationStep | None:
-        """The belief at the end of an episode from many more draws; None with the paper's filter,
-        whose particles are what they are."""
+    @property
+    def closing(self) -> Closing | None:
+        """What finds the belief at the end of an episode from many more draws; None with the
+        paper's filter, whose particles are what they are."""
+        return None if self.kind == "paper" else self._refine
+
+    def held(self, episode: Episode, state: EstimatorState) -> Belief | None:
+        """The belief of the step that left the state; None with the paper's filter."""
         if self.kind == "paper":
             return None
-        return refine(episode, self.shape, state, self.settings)
+        return held_belief(episode, self.shape, state, self.settings)
 
     def learn(self, episode: Episode, generator: torch.Generator) -> EstimationStep:
         """The belief after a whole episode."""
         *_, last = self.steps(episode, generator)
-        return self.closing_step(episode, last.state) or last
+        return last if self.closing is None else self.closing(episode, last.state)
+
+    def _refine(self, episode: Episode, state: EstimatorState) -> EstimationStep:
+        return refine(episode, self.shape, state, self.settings)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from typing import Any
 from eval.lines import append_lines, read_lines, write_line
 from eval.unseen import UNSEEN
 from tpcd.cli import check_numbers, run
+from tpcd.errors import FileError
 
 ROWS = (
     "paper/random",
@@ -195,6 +196,8 @@ def read_cells(folder: Path) -> list[dict[str, Any]]:
     for path in sorted(folder.glob("cells-*.jsonl")):
         for row in read_lines(path):
             if "failed" not in row:
+                if "open_mae" not in row:
+                    raise FileError(path, "has cells of an earlier version", "start a new folder")
                 cells[tuple(row[name] for name in KEY)] = row
     return list(cells.values())
 

@@ -78,21 +78,25 @@ def run_cell(
     policy = make_policy(cell.policy, Limits(), scene, seed)  # type: ignore[arg-type]
     estimator = Estimator(shape, cell.estimator)  # type: ignore[arg-type]
     row: dict[str, Any] = {**vars(cell), "prior": prior, "moves": [], "mae": [], "sd": []}
+    row.update({"open_mae": [], "closing_s": 0.0})
     row.update({"coverage_50": [], "coverage_90": [], "contact_90": []})
-    learnt, choosing = [], 0.0
+    learnt, choosing, learning = [], 0.0, 0.0
     started = time.perf_counter()
     for step in explore(robot, policy, estimator, seed):
         learnt.append(step.estimation)
         choosing += step.choosing_seconds
+        learning += step.estimation.seconds
         moves = len(step.episode) - 1
         if moves in CHECKPOINTS or moves == steps:
-            closed = None
-            if moves == steps:
-                closed = estimator.closing_step(step.episode, step.estimation.state)
-            belief = (closed or step.estimation).belief
+            belief = step.estimation.belief
             found = _test(top_particles(belief, TOP) if cell.estimator == "paper" else belief,
                           recordings)  # fmt: skip
             row["moves"].append(moves)
+            row["open_mae"].append(found["mae"])
+            if moves == steps and estimator.closing is not None:
+                learnt[-1] = estimator.closing(step.episode, step.estimation.state)
+                row["closing_s"] = learnt[-1].seconds
+                found = _test(learnt[-1].belief, recordings)
             for name, value in found.items():
                 row[name] = value if name == "transform" else [*row[name], value]
         if moves == steps:
@@ -101,8 +105,7 @@ def run_cell(
     row["peak_wrench"] = true.abs().amax(0).tolist()
     row["largest_force"] = float(step.episode.wrenches[:, :2].abs().max())
     row["choosing_s"] = choosing / steps
-    row["learning_s"] = sum(one.seconds for one in learnt) / steps
-    row["closing_s"] = 0.0 if closed is None else closed.seconds
+    row["learning_s"] = learning / steps
     row["seconds"] = time.perf_counter() - started
     return Outcome(row, scene, learnt, robot.recording(step.episode), recordings[0])
 

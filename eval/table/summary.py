@@ -47,6 +47,7 @@ def summarise(cells: Sequence[Row]) -> list[Row]:
             line[key] = float(np.mean([row[key][-1] for row in chosen]))
         line["choosing_s"] = float(np.mean([row["choosing_s"] for row in chosen]))
         line["learning_s"] = float(np.mean([row["learning_s"] for row in chosen]))
+        line["closing_s"] = float(np.mean([row["closing_s"] for row in chosen]))
         table.append(line)
     return table
 
@@ -62,8 +63,8 @@ def printed(line: Row) -> Row:
     for key, name in (("coverage_50", "in 50 %"), ("coverage_90", "in 90 %")):
         shown[name] = f"{line[key]:.0%}"
     shown["in 90 %, contact"] = f"{line['contact_90']:.0%}"
-    for key, name in (("choosing_s", "choosing [s]"), ("learning_s", "learning [s]")):
-        shown[name] = f"{line[key]:.2f}"
+    for name in ("choosing", "learning", "closing"):
+        shown[f"{name} [s]"] = f"{line[f'{name}_s']:.2f}"
     return shown
 
 
@@ -106,7 +107,8 @@ def paired(cells: Sequence[Row], truth: str, first: str, second: str) -> list[tu
 
 
 def curves(cells: Sequence[Row], truth: str) -> dict[str, tuple[Array, Array]]:
-    """For each row the numbers of moves and the mean error of x and z after them [mm]."""
+    """For each row the numbers of moves and the mean error of x and z after them [mm], of the
+    beliefs that the policy goes on with (without the closing draws)."""
     found = {}
     for name in dict.fromkeys(label(row) for row in cells if row["truth"] == truth):
         chosen = [row for row in cells if row["truth"] == truth and label(row) == name]
@@ -116,7 +118,7 @@ def curves(cells: Sequence[Row], truth: str) -> dict[str, tuple[Array, Array]]:
                 [
                     np.mean(e[:2])
                     for row in chosen
-                    for m, e in zip(row["moves"], row["mae"], strict=True)
+                    for m, e in zip(row["moves"], row["open_mae"], strict=True)
                     if m == count
                 ]
             )  # fmt: skip

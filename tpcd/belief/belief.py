@@ -1,7 +1,7 @@
 """The belief over theta: estimated from an episode, held by users, saved and loaded.
 
 `estimate` brings in the transitions of an episode one by one and yields the belief after
-each; `refine` gives the last one many more draws. A belief holds weighted particles of theta
+each (the last one gets more draws in `refinement`). A belief holds weighted particles of theta
 and, for each particle, the normal posterior of the outline misfit; it is all that prediction
 needs besides the shape model.
 """
@@ -28,6 +28,7 @@ from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.belief.resampling import weighted_quantile
 from tpcd.belief.state import EstimatorState
 from tpcd.belief.target import ContactTarget
 from tpcd.contact import scene_from_parameters, terrain_gaps
@@ -147,7 +148,7 @@ def estimate(
     """
     settings = settings or EstimatorSettings()
     history = history_of(episode)
-    target = _target(episode, shape, settings)
+    target = target_of(episode, shape, settings)
     if state is None:
         cloud = start_cloud(target.sample(settings.sampler.particles, generator))
     else:
@@ -162,29 +163,8 @@ def estimate(
         yield EstimationStep(k, belief, info, seconds, after)
 
 
-def refine(
-    episode: Episode,
-    shape: Shape,
-    state: EstimatorState,
-    settings: EstimatorSettings | None = None,
-) -> EstimationStep:
-    """The belief that `state` holds, found once more with many more draws.
-
-    After each transition the sampler spends little; what it found then is where
-    `settings.closing_budget` begins. The state stays as it is, and the same state gives
-    the same belief. Raises ValueError where no particle can explain the episode.
-    """
-    settings = settings or EstimatorSettings()
-    started = time.perf_counter()
-    generator = torch.Generator()
-    cloud = cloud_from_tensors(state.restore(generator))
-    target = _target(episode, shape, settings).given(history_of(episode).first(state.index))
-    cloud, info = assimilate(cloud, target, state.index, settings.closing_budget, generator)
-    belief = belief_of(cloud, target)
-    return EstimationStep(state.index, belief, info, time.perf_counter() - started, state)
-
-
-def _target(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
+def target_of(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
+    """The posterior to sample from, still without data."""
     prior = make_prior(shape, episode.priors, settings.effects)
     return ContactTarget(prior, misfit_field(shape, settings), settings.step)
 
@@ -200,7 +180,7 @@ def prior_belief(
     Where none does, all of them.
     """
     settings = settings or EstimatorSettings()
-    target = _target(episode, shape, settings)
+    target = target_of(episode, shape, settings)
     prior, misfit = target.prior, target.misfit
     score = target.sample(settings.sampler.particles, generator)
     vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
@@ -232,16 +212,6 @@ def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
         spread=settings.misfit_spread,
         width=settings.misfit_width,
     )
-
-
-def weighted_quantile(
-    values: Float[Tensor, " m *columns"], weights: Float[Tensor, " m"], level: float
-) -> Float[Tensor, "*columns"]:
-    """Smallest value of each column at which the weights sum up to the level."""
-    ordered, order = values.sort(dim=0)
-    cumulative = weights[order].cumsum(0)
-    first = (cumulative >= level * cumulative[-1]).double().argmax(0)
-    return ordered.gather(0, first[None])[0]
 
 
 def belief_of(cloud: Cloud, target: ContactTarget) -> Belief:

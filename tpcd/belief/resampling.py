@@ -48,3 +48,13 @@ def multinomial_resample(
     index = torch.searchsorted(cumulative, positions.to(cumulative.device), right=True)
     last = int(torch.nonzero(weights > 0).max())
     return index.clamp(max=last)
+
+
+def weighted_quantile(
+    values: Float[Tensor, " m *columns"], weights: Float[Tensor, " m"], level: float
+) -> Float[Tensor, "*columns"]:
+    """Smallest value of each column at which the weights sum up to the level."""
+    ordered, order = values.sort(dim=0)
+    cumulative = weights[order].cumsum(0)
+    first = (cumulative >= level * cumulative[-1]).double().argmax(0)
+    return ordered.gather(0, first[None])[0]

@@ -2,7 +2,9 @@
 
 The folder holds `belief.*` and `state.safetensors` (saved after every step), `steps.jsonl`
 (one line for each step), `summary.json`, `figures/*.png` and a TensorBoard run in
-`tensorboard`. With the state, a run that was stopped goes on where it was.
+`tensorboard`. With the state, a run that was stopped goes on where it was. At the end the belief is
+found once more from many more draws: `belief.*`, `summary.json` and `closed` in the last line of
+`steps.jsonl` are of that one, and the state stays that of the step.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
 from tpcd.commands.summary import prior_summary, summarise
 from tpcd.data.episode import Episode
+from tpcd.exploration import Closing
 from tpcd.files import write_json, write_text
 
 STEPS_FILE = "steps.jsonl"
@@ -30,9 +33,6 @@ FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
-
-Closing = Callable[[Episode, EstimatorState], EstimationStep | None]
-"""Finds the belief at the end of an episode from many more draws; None where that is not done."""
 
 
 def run_estimation(
@@ -67,12 +67,14 @@ class EstimationRun:
         state: EstimatorState | None = None,
         show_progress: bool = True,
         closing: Closing | None = None,
+        belief: Belief | None = None,
     ) -> None:
-        """The steps up to the `state` of an earlier run in the folder are kept."""
+        """The steps up to the `state` of an earlier run in the folder are kept; their belief is
+        read back where it is not given."""
         done = 0 if state is None else state.index
         self.folder, self.state, self._closing = folder, state, closing
         self.history = _earlier_rows(folder / STEPS_FILE, done)
-        self.belief = load_belief(folder) if done else None
+        self.belief = load_belief(folder) if done and belief is None else belief
         self._prior_name, self._done = prior_name, done
         self._total, self._show = total, show_progress
 
@@ -123,29 +125,37 @@ class EstimationRun:
         """Close the estimation, write the summary and the figures; returns the belief."""
         if self.belief is None or self.state is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
-        if self._closing is not None:
-            self.bar.set_postfix_str("all data are in; many more draws of the belief")
-            self._replace_last(self._closing(episode, self.state))
+        last = self._close(episode) or self.history[-1]
         write_json(self.folder / "summary.json", summarise(self.belief))
-        warning = few_draws_warning(self.history[-1])
+        warning = few_draws_warning(last)
         if warning is not None:
             self.bar.write(warning, file=sys.stderr)
-        figures = self.folder / "figures"
-        draw_estimation(self.belief, self.history, episode, figures, self.writer, truth)
+        rows = [*self.history[:-1], last]
+        draw_estimation(self.belief, rows, episode, self.folder / "figures", self.writer, truth)
         return self.belief
 
-    def _replace_last(self, step: EstimationStep | None) -> None:
-        """Save a step in place of the last one; the state is that of both."""
-        if step is None:
-            return
+    def _close(self, episode: Episode) -> dict[str, Any] | None:
+        """Find and save the last belief anew; its row, or None where that is not to be had."""
+        if self._closing is None:
+            return None
+        assert self.state is not None
+        self.bar.set_postfix_str("all data are in: drawing the last belief again, and more often")
+        try:
+            step = self._closing(episode, self.state)
+        except ValueError as error:
+            self.bar.write(f"warning: the last belief is as it was: {error}", file=sys.stderr)
+            return None
         self.belief = step.belief
-        last = self.history[-1]
-        row = {**step_row(step, last["learnt_most"]), "closing_seconds": step.seconds}
-        self.history[-1] = {**last, **row, "seconds": last["seconds"]}
-        lines = "".join(json.dumps(row) + "\n" for row in self.history)
-        write_text(self.folder / STEPS_FILE, lines)
+        row = step_row(step, self.history[-1]["learnt_most"])
+        self.history[-1] = {**self.history[-1], "closed": row}
+        self._lines.close()
+        _write_rows(self.folder / STEPS_FILE, self.history)
         save_belief(step.belief, self.folder, self._prior_name)
-        _log_scalars(self.writer, self.history[-1], step)
+        for name in ("effective_sample_size", "log_evidence", "seconds"):
+            self.writer.add_scalar(f"closing/{name}", row[name], step.index)
+        size = row["effective_sample_size"]
+        self.bar.set_postfix_str(f"n_eff {size:.0f} of {step.info.draws}, {step.seconds:.1f} s")
+        return row
 
 
 def few_draws_warning(row: dict[str, Any]) -> str | None:
@@ -163,11 +173,18 @@ def few_draws_warning(row: dict[str, Any]) -> str | None:
 
 
 def _earlier_rows(path: Path, done: int) -> list[dict[str, Any]]:
-    """The first rows of the file; later ones, of a step that was not finished, are dropped."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """The first rows of the file; later ones, of a step that was not finished, are dropped, and
+    so is how the run ended then."""
     lines = path.read_text(encoding="utf-8").splitlines()[:done] if done else []
-    path.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
-    return [json.loads(line) for line in lines]
+    rows = [json.loads(line) for line in lines]
+    for row in rows:
+        row.pop("closed", None)
+    _write_rows(path, rows)
+    return rows
+
+
+def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def _learnt_most(before: Belief | None, now: Belief) -> str:

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tpcd.belief.belief import Belief, weighted_quantile
+from tpcd.belief.belief import Belief
+from tpcd.belief.resampling import weighted_quantile
 
 STILL_PRIOR = 0.85
 """A 90 % interval wider than this share of the prior's counts as nothing learnt."""

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
-from tpcd.belief.belief import Belief, weighted_quantile
+from tpcd.belief.belief import Belief
+from tpcd.belief.resampling import weighted_quantile
 from tpcd.contact import place_points
 from tpcd.discrepancy.coverage import Coverage
 from tpcd.discrepancy.diagnosis import Estimate, Limit, NamedEffect

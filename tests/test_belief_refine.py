@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from linear_model import DIMENSION, LinearModel
+from short_episode import short_episode
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, refine
 from tpcd.belief.belief import EstimationStep
@@ -20,10 +21,7 @@ from tpcd.commands.estimation import run_estimation
 from tpcd.data.episode import Episode
 from tpcd.effects import find_effect
 from tpcd.exploration import Estimator
-from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
-from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
 
 PRIOR, STEPS = "ycb21-z2", 4
 SETTINGS = EstimatorSettings(sampler=SamplerSettings(particles=64, draws=600, closing=5))
@@ -31,10 +29,7 @@ SETTINGS = EstimatorSettings(sampler=SamplerSettings(particles=64, draws=600, cl
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
-    generator = torch.Generator().manual_seed(3)
-    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
-    motion = make_motion("rich", scene, STEPS, generator)
-    return record(make_truth(scene, "quasistatic"), scene, motion, STEPS, generator).measured
+    return short_episode(STEPS)
 
 
 @pytest.fixture(scope="module")

@@ -115,7 +115,7 @@ def test_an_interrupted_estimate_leaves_what_was_there(
     out = tmp_path / "run"
     if overwrite:
         shutil.copytree(world / "run", out)
-    monkeypatch.setattr("tpcd.belief.estimate", interrupted)
+    monkeypatch.setattr("tpcd.exploration.estimate", interrupted)
     arguments = (*estimate_arguments(world, out), *(["--overwrite"] if overwrite else []))
     assert "interrupted" in refused(capsys, tmp_path, "estimate", *arguments, code=130)
 
@@ -130,7 +130,7 @@ def test_an_estimate_interrupted_after_a_step_goes_on(world, tmp_path, monkeypat
     whole, out = tmp_path / "whole", tmp_path / "run"
     assert call("estimate", *estimate_arguments(world, whole)) == 0
     with monkeypatch.context() as patch:
-        patch.setattr("tpcd.belief.estimate", interrupted)
+        patch.setattr("tpcd.exploration.estimate", interrupted)
         assert call("estimate", *estimate_arguments(world, out)) == 130
     assert "run goes on with --resume" in capsys.readouterr().err
     assert call("estimate", *estimate_arguments(world, out), "--resume") == 0

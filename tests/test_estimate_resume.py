@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from short_episode import short_episode
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.belief import EstimationStep
@@ -18,10 +19,7 @@ from tpcd.belief.storage import load_belief
 from tpcd.commands.estimation import run_estimation
 from tpcd.data.episode import Episode
 from tpcd.errors import RunError
-from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
-from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
 
 PRIOR = "ycb21-z2"
 STEPS = 4
@@ -29,10 +27,7 @@ STEPS = 4
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
-    generator = torch.Generator().manual_seed(3)
-    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
-    motion = make_motion("rich", scene, STEPS, generator)
-    return record(make_truth(scene, "quasistatic"), scene, motion, STEPS, generator).measured
+    return short_episode(STEPS)
 
 
 def steps(

@@ -16,11 +16,11 @@ from tpcd.discrepancy import naming, search
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
-from tpcd.discrepancy.formula import FORMULAS
 from tpcd.discrepancy.naming import Round, Workbench
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.effects import Effect, find_effect
+from tpcd.effects.formula import FORMULAS
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings

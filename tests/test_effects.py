@@ -11,8 +11,7 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.contact import ContactScene
-from tpcd.discrepancy.formula import FORMULAS
-from tpcd.effects import CATALOGUE, Effect
+from tpcd.effects import KNOWN, Effect
 from tpcd.effects.conditions import Rows
 from tpcd.effects.protocol import Added
 from tpcd.effects.simulate import simulate_rows
@@ -44,7 +43,7 @@ def run(hidden: dict[str, dict[str, float]], *commands: tuple[float, float, floa
         0.0,
         WALL_AT,
         STIFFNESS,
-        added_effects(hidden, (*CATALOGUE, *FORMULAS)),
+        added_effects(hidden),
         len(commands),
     )
     truth.reset(vector(0.0, 0.01, 0.0))
@@ -65,7 +64,7 @@ def history() -> History:
     return history_of(record(truth, scene, motion, 8, generator).measured)
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.name)
+@pytest.mark.parametrize("effect", KNOWN, ids=lambda effect: effect.name)
 @pytest.mark.parametrize("compiled", [True, False])
 def test_null_values_change_no_bit(
     effect: Effect, compiled: bool, history: History, monkeypatch: pytest.MonkeyPatch

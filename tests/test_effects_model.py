@@ -17,9 +17,9 @@ from tpcd.belief.history import history_of
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.data.episode import Episode, write_episode
-from tpcd.effects import CATALOGUE, Effect
+from tpcd.effects import CATALOGUE, KNOWN, Effect
 from tpcd.effects.check import check_effect
-from tpcd.effects.model import load_effects, load_model
+from tpcd.effects.model import Model, load_effects, load_model, write_model
 from tpcd.effects.protocol import Added
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.errors import ModelError
@@ -87,9 +87,17 @@ def test_the_example_does_what_it_says(wet: Effect) -> None:
     assert ratios[3] == pytest.approx(0.5 * torch.tensor(-0.7).exp().item(), rel=1e-3)
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.name)
+@pytest.mark.parametrize("effect", KNOWN, ids=lambda effect: effect.name)
 def test_the_catalogue_keeps_its_promises(effect: Effect) -> None:
     check_effect(effect)
+
+
+@pytest.mark.parametrize("effect", KNOWN, ids=lambda effect: effect.name)
+def test_every_effect_comes_back_from_a_model_file(effect: Effect, tmp_path: Path) -> None:
+    again = load_model(write_model(Model((effect,)), tmp_path / "model.yaml"))
+    assert [one.name for one in again.effects] == [effect.name]
+    assert again.effects[0].parameters == effect.parameters
+    assert again.effects[0].sentence(["1"] * 3) == effect.sentence(["1"] * 3)
 
 
 def test_an_estimate_takes_the_example(folder: Path, episode: Episode, tmp_path: Path) -> None:

@@ -177,6 +177,18 @@ def test_a_rippled_floor_lifts_by_its_waves():
     assert np.allclose(heights, 0.001 * np.sin(2 * np.pi * x / 0.08), atol=5 * LENGTH)
 
 
+@pytest.mark.parametrize("height", [0.002, -0.002])
+def test_a_bump_lifts_what_passes_it_and_a_dent_lets_it_sink(height: float):
+    rows = follow(
+        {"floor_bump": {"height": height, "x": 0.02}},
+        (0, 0.03, 0), (0.02, 0.03, 0), (0.06, 0.03, 0), (0.03, 0.03, 0),
+        vertices=WEDGE, friction=0.2,
+    )  # fmt: skip
+    x, heights = np.array([lowest(WEDGE, row) for row in rows]).T
+    assert np.ptp(heights) > 0.0015
+    assert np.allclose(heights, height * np.exp(-0.5 * ((x - 0.02) / 0.012) ** 2), atol=5 * LENGTH)
+
+
 def slide_ratios(hidden, depth=0.05, **scene) -> list[float]:
     """F_t / F_n on the floor after sliding right and left."""
     z = 0.03 - depth

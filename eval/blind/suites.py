@@ -46,6 +46,7 @@ OUTSIDE: Sizes = {
     "floor_step": {"height": 3e-3, "x": 0.05},
     "friction_field": {"slope": 6.0},
     "floor_ripple": {"height": 1.5e-3, "length": 0.06},
+    "floor_bump": {"height": 3e-3, "x": 0.05},
 }
 """Effects that the catalogue does not have, the last not even a formula; MuJoCo alone can be given
 them."""
@@ -54,6 +55,7 @@ PLACES = frozenset(
         ("payload", "lever"),
         ("floor_step", "x"),
         ("floor_ripple", "length"),
+        ("floor_bump", "x"),
         ("grasp_slip", "at"),
     }
 )

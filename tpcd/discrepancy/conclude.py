@@ -11,11 +11,11 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import Fit, fit_model, posterior
-from tpcd.discrepancy.formula import FORMULAS
 from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors, typical_share
 from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.variants import NUMERICS, Variant
+from tpcd.effects.formula import FORMULAS
 from tpcd.random import stream
 
 HALF = 0.5

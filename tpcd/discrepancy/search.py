@@ -20,7 +20,6 @@ from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.evidence import TIED, Fit, Question
-from tpcd.discrepancy.formula import FORMULAS
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import (
     Round,
@@ -39,6 +38,7 @@ from tpcd.discrepancy.settings import (
     DiagnosisSettings,
 )
 from tpcd.discrepancy.variants import FINER, Variant, step_halving
+from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
 

@@ -1,6 +1,6 @@
 """Effects that a model may lack, each at its fixed site, and the catalogue of them."""
 
-from tpcd.effects.catalogue import CATALOGUE, find_effect
+from tpcd.effects.catalogue import CATALOGUE, KNOWN, find_effect
 from tpcd.effects.conditions import (
     FLOOR,
     WALL,
@@ -16,6 +16,7 @@ from tpcd.effects.protocol import Added, Effect, EffectParameter, effect_paramet
 __all__ = [
     "CATALOGUE",
     "FLOOR",
+    "KNOWN",
     "WALL",
     "Added",
     "Conditions",

@@ -29,6 +29,15 @@ def with_plane(
     return conditions
 
 
+def on_curve(conditions: Conditions, x: Tensor, height: Tensor, slope: Tensor) -> Conditions:
+    """The conditions with the tangent of a bent floor at x (m, r) [m], where it is higher by
+    `height` [m] and steeper by `slope` than the plane."""
+    normal, offset = conditions.normal[:, :, FLOOR], conditions.offset[:, :, FLOOR]
+    height = (offset - normal[..., 0] * x) / normal[..., 1] + height
+    normal = turned(normal, slope.atan())
+    return with_plane(conditions, FLOOR, normal, normal[..., 0] * x + normal[..., 1] * height)
+
+
 def sunk(
     conditions: Conditions, terrain: int, sink: Tensor, rows: Rows, outcome: Outcome
 ) -> Conditions:
@@ -76,12 +85,8 @@ def _curvature(
 ) -> Conditions:
     if outcome is None:
         return conditions
-    # The tangent at the place of contact.
     bend, x = column(values, 0), outcome.place[:, :, FLOOR, 0]
-    normal, offset = conditions.normal[:, :, FLOOR], conditions.offset[:, :, FLOOR]
-    height = (offset - normal[..., 0] * x) / normal[..., 1] + 0.5 * bend * x**2
-    normal = turned(normal, (bend * x).atan())
-    return with_plane(conditions, FLOOR, normal, normal[..., 0] * x + normal[..., 1] * height)
+    return on_curve(conditions, x, 0.5 * bend * x**2, bend * x)
 
 
 def _floor_drift(

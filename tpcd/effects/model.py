@@ -3,7 +3,7 @@
 A YAML file:
 
     effects:
-      - name: floor_compliance           # from the catalogue
+      - name: floor_compliance           # from the catalogue, or a formula
         parameters:                      # optional: narrower priors, SI units
           compliance: [1.0e-4, 4.0e-4]
         found:                           # optional: mean and standard deviation
@@ -29,7 +29,7 @@ from typing import Any
 
 import yaml
 
-from tpcd.effects.catalogue import CATALOGUE, find_effect
+from tpcd.effects.catalogue import KNOWN, find_effect
 from tpcd.effects.check import check_effect
 from tpcd.effects.declare import DeclaredEffect
 from tpcd.effects.protocol import SITES, Effect, EffectParameter, effect_to_plain
@@ -131,7 +131,7 @@ def effects_from_plain(plain: Any, path: Path) -> tuple[Effect, ...]:
             raise ModelError(
                 path, f"has the effect {dict(entry)!r}", "expected name, file, parameters and found"
             )
-        own: Iterable[Effect] = CATALOGUE
+        own: Iterable[Effect] = KNOWN
         if entry.get("file"):
             file = path.parent / str(entry["file"])
             own = load_effects(file)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.contact import ContactScene
-from tpcd.effects.catalogue import CATALOGUE, find_effect
+from tpcd.effects.catalogue import KNOWN, find_effect
 from tpcd.effects.conditions import sequence
 from tpcd.effects.protocol import Added, Effect
 from tpcd.effects.simulate import simulate_rows
@@ -22,7 +22,7 @@ TRUE_PASSES = 8
 
 
 def added_effects(
-    hidden: Mapping[str, Mapping[str, float]], catalogue: Sequence[Effect] = CATALOGUE
+    hidden: Mapping[str, Mapping[str, float]], among: Sequence[Effect] = KNOWN
 ) -> Added:
     """Effects with given parameters in SI units; what is not given has its null value.
 
@@ -30,7 +30,7 @@ def added_effects(
     """
     effects, values = [], []
     for name, given in hidden.items():
-        effect = find_effect(name, catalogue)
+        effect = find_effect(name, among)
         known = [parameter.name for parameter in effect.parameters]
         for own in given:
             if own not in known:

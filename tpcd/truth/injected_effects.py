@@ -48,6 +48,7 @@ FORMS = {
     "floor_curvature": EffectForm(("curvature",)),
     "floor_step": EffectForm(("height",), ("x",)),
     "floor_ripple": EffectForm(("height",), ("length",)),
+    "floor_bump": EffectForm(("height",), ("x",)),
     "floor_drift": EffectForm(("drift",)),
     "wall_friction": LOG_RATIO,
     "directional_friction": LOG_RATIO,

@@ -39,6 +39,8 @@ STEP_LENGTH = 0.005
 """Length over which the step in the floor rises [m]."""
 LARGEST_TURN = 0.35
 """Angle from upright up to which the object can meet a bulging floor [rad]."""
+BUMP_WIDTH = 0.012
+"""Standard deviation of the bump in the floor, which has the form of a normal density [m]."""
 BOX = 1.0
 """Half the side of the boxes [m]."""
 
@@ -57,11 +59,20 @@ class FloorShape:
     """Amplitude of a wave along the floor [m]."""
     ripple_length: float = 1.0
     """Length of the wave [m]."""
+    bump_height: float = 0.0
+    """Of a single bump, a dent where negative [m]."""
+    bump_x: float = 0.0
+    """Where it is highest [m]."""
 
     @property
     def is_flat(self) -> bool:
         """Whether one plane will do."""
-        return self.curvature == self.step_height == self.ripple_height == 0.0
+        return self.curvature == 0.0 and self.is_bowl
+
+    @property
+    def is_bowl(self) -> bool:
+        """Whether it has nothing but a tilt and a curvature."""
+        return self.step_height == self.ripple_height == self.bump_height == 0.0
 
     @property
     def ripple_number(self) -> float:
@@ -73,7 +84,7 @@ class FloorShape:
         share = np.clip((x - self.step_x) / STEP_LENGTH, 0.0, 1.0)
         step = self.step_height * share**2 * (3.0 - 2.0 * share)
         ripple = self.ripple_height * np.sin(self.ripple_number * x)
-        return self.slope * x + self.curvature * x**2 / 2 + step + ripple
+        return self.slope * x + self.curvature * x**2 / 2 + step + ripple + self._bump(x)
 
     def rise(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Angle of the floor from x towards z [rad] at x [m]."""
@@ -81,7 +92,11 @@ class FloorShape:
         step = self.step_height * 6.0 * share * (1.0 - share) / STEP_LENGTH
         number = self.ripple_number
         ripple = self.ripple_height * number * np.cos(number * x)
-        return np.arctan(self.slope + self.curvature * x + step + ripple)
+        bump = -(x - self.bump_x) / BUMP_WIDTH**2 * self._bump(x)
+        return np.arctan(self.slope + self.curvature * x + step + ripple + bump)
+
+    def _bump(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        return self.bump_height * np.exp(-0.5 * ((x - self.bump_x) / BUMP_WIDTH) ** 2)
 
 
 def floor_shape(effects: ActiveEffects) -> FloorShape:
@@ -93,6 +108,8 @@ def floor_shape(effects: ActiveEffects) -> FloorShape:
         effects.get("floor_step", "x"),
         effects.get("floor_ripple", "height"),
         effects.get("floor_ripple", "length") or 1.0,
+        effects.get("floor_bump", "height"),
+        effects.get("floor_bump", "x"),
     )
 
 
@@ -108,10 +125,11 @@ def floor_points(
     close along the outline that the floor enters by 5 µm between them (or every 1 mm), and
     kept if they come near the lowest one at some turn within `LARGEST_TURN` of `angle`.
     """
-    if shape.step_height == shape.ripple_height == 0.0 and shape.curvature >= 0.0:
+    if shape.is_bowl and shape.curvature >= 0.0:
         return hull
     bend = abs(shape.curvature) + 6.0 * abs(shape.step_height) / STEP_LENGTH**2
     bend += abs(shape.ripple_height) * shape.ripple_number**2
+    bend += abs(shape.bump_height) / BUMP_WIDTH**2
     spacing = min(max(math.sqrt(8.0 * 5e-6 / bend), 1e-3), 4e-3)
     points = []
     for first, second in zip(outline_ee, np.roll(outline_ee, -1, axis=0), strict=True):
@@ -120,7 +138,7 @@ def floor_points(
     candidates = np.concatenate((hull, *points))
     span = float(np.ptp(hull, axis=0).max())
     bulge = abs(shape.curvature) * span**2 / 2 + abs(shape.step_height) + 1e-4
-    bulge += 2.0 * abs(shape.ripple_height)
+    bulge += 2.0 * abs(shape.ripple_height) + abs(shape.bump_height)
     turns = angle + np.linspace(-LARGEST_TURN, LARGEST_TURN, 41)
     heights = candidates @ np.array([np.sin(turns), np.cos(turns)])
     near = (heights - heights.min(axis=0) < bulge).any(axis=1)

@@ -7,6 +7,7 @@ people to find out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows, angle_difference
 from tpcd.effects.declare import DeclaredEffect, column
-from tpcd.effects.geometry import sunk, with_plane
+from tpcd.effects.geometry import on_curve, sunk, with_plane
 from tpcd.effects.protocol import EffectParameter
 
 Covariate = Callable[[Outcome, Rows], Tensor]
@@ -68,6 +69,17 @@ def _step(
     return with_plane(conditions, FLOOR, offset=conditions.offset[:, :, FLOOR] + height * rise)
 
 
+def _wave(
+    conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+) -> Conditions:
+    if outcome is None:
+        return conditions
+    height, length, shift = (column(values, i) for i in range(3))
+    x, number = outcome.place[:, :, FLOOR, 0], 2 * math.pi / length
+    turns = number * x + 2 * math.pi * shift
+    return on_curve(conditions, x, height * turns.sin(), height * number * turns.cos())
+
+
 def _stiffening(
     conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
 ) -> Conditions:
@@ -110,6 +122,22 @@ FORMULAS = (
         "the floor is higher by {0} beyond x = {1}",
         needs=("floor places",),
         passes=1,
+    ),
+    DeclaredEffect(
+        "floor_height ~ wave",
+        "geometry",
+        (
+            EffectParameter("height", "m", -0.005, 0.005, shown_unit="mm", shown_factor=1e3),
+            EffectParameter("length", "m", 0.03, 0.15, 0.06, shown_unit="mm", shown_factor=1e3),
+            EffectParameter(
+                "shift", "1", -0.25, 0.25, shown_unit="% of its length", shown_factor=100.0
+            ),
+        ),
+        _wave,
+        "the floor is a wave of {0} with a length of {1}, which rises through its mean {2} before"
+        " x = 0",
+        needs=("floor places",),
+        passes=2,
     ),
     DeclaredEffect(
         "floor_height ~ root of load",

@@ -12,6 +12,7 @@ from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
+from tpcd.data.episode import Episode
 from tpcd.discrepancy import naming, search
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
@@ -49,6 +50,14 @@ def episode():
     return found
 
 
+def bench_of(episode: Episode) -> Workbench:
+    question = Question(
+        joined_history([episode]), make_prior(PolygonShape(builtin_outlines()["mug"])),
+        MisfitField(0.0), StepSettings(), SETTINGS.sampler,
+    )  # fmt: skip
+    return Workbench(question, SETTINGS, coverage_of([episode]), 0, lambda line: None)
+
+
 def test_effects_that_the_data_hardly_excite_are_tried_before_formulas(
     episode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,17 +78,40 @@ def test_effects_that_the_data_hardly_excite_are_tried_before_formulas(
     assert asked == [(names, True), (names, False), (formulas, True)]
 
 
+def test_the_catalogue_is_asked_once_more_beside_a_formula(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[tuple[str, ...], int]] = []
+    effect, formula = CATALOGUE[1], FORMULAS[0]
+
+    def named(bench: Workbench, current: Fit, pool, adequate: bool, excited: bool) -> Round:
+        asked.append((current.names, len(pool)))
+        found = None if current.effects else fit_model(bench.question, (effect,), (0,))
+        return Round(current, found)
+
+    def swapped(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Fit:
+        assert base.effects == () and current.effects == (effect,) and explained
+        return fit_model(bench.question, (formula,), (0,))
+
+    monkeypatch.setattr(search, "name_one", named)
+    monkeypatch.setattr(search, "outdone", swapped)
+    monkeypatch.setattr(search, "better_base", lambda *_: None)
+    monkeypatch.setattr(search, "find_confusions", lambda *_: None)
+    monkeypatch.setattr(search, "fitted_out", lambda bench, fit: fit)
+    monkeypatch.setattr(search, "step_halving", lambda *_: 0.0)
+    monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: Adequacy(0.01, 0.5, 0.5, ()))
+    found = search._search(bench_of(episode), ())
+    size = len(CATALOGUE)
+    assert asked == [((), size), ((effect.name,), size), ((formula.name,), size)]
+    assert found.final.effects == (formula,) and found.base.effects == () and found.close == ()
+
+
 @pytest.mark.parametrize("excited", [True, False])
 def test_a_look_is_at_effects_that_the_data_excite_or_at_the_others(
     episode, excited: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shape = PolygonShape(builtin_outlines()["mug"])
-    question = Question(
-        joined_history([episode]), make_prior(shape), MisfitField(0.0), StepSettings(),
-        SETTINGS.sampler,
-    )  # fmt: skip
-    bench = Workbench(question, SETTINGS, coverage_of([episode]), 0, lambda line: None)
-    fit = fit_model(question, (), (0,))
+    bench = bench_of(episode)
+    fit = fit_model(bench.question, (), (0,))
     looked: list[str] = []
 
     def glance(question: Question, current: Fit, effect: Effect, fresh: int) -> Glance:
@@ -113,12 +145,8 @@ def test_another_shape_need_only_be_as_good_as_an_effect(
     shape: float, numerics: float, rival: float | None, chosen: str | None, episode, monkeypatch
 ) -> None:
     """Gains over the base model; 6 is asked for."""
-    known = PolygonShape(builtin_outlines()["mug"])
-    question = Question(
-        joined_history([episode]), make_prior(known), MisfitField(0.0), StepSettings(),
-        SETTINGS.sampler,
-    )  # fmt: skip
-    bench = Workbench(question, SETTINGS, coverage_of([episode]), 0, lambda line: None)
+    bench = bench_of(episode)
+    question = bench.question
 
     def fit(gain: float) -> Fit:
         return Fit((), question.step, question.scene, (100.0 + gain,), ())

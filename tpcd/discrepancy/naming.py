@@ -139,7 +139,7 @@ def name_one(
         effects, found = (*current.effects, effect), places[effect.name]
         return fit_model(question, effects, (0,), start=(current,), places=found)
 
-    fits = _each(bench, chosen, number, fitted)
+    fits = each_of(bench, chosen, number, fitted)
     top = max((fit.log_evidence for fit in fits), default=-math.inf)
     near = [
         fitted_again(bench, fit, 1, (current,), places=places[fit.names[-1]])
@@ -237,7 +237,7 @@ def _glances(
         again = {(effect.name, number) for effect in others}
         bench.candidates[:] = [c for c in bench.candidates if (c.name, c.round) not in again]
     fresh = FRESH[adequate] if bench.settings.from_prior else 0
-    glances = _each(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
+    glances = each_of(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
     return sorted(glances, key=lambda g: -g.log_evidence)
 
 
@@ -293,7 +293,7 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
     return Round(current, best if accepted else None, close)
 
 
-def _each(
+def each_of(
     bench: Workbench, effects: Sequence[Effect], number: int, work: Callable[[Effect], Result]
 ) -> list[Result]:
     """Do something with every candidate; one that fails costs no other."""

@@ -31,6 +31,7 @@ from tpcd.discrepancy.naming import (
     name_one,
     pruned,
 )
+from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import (
     FEWEST_DRAWS,
     FEWEST_ROWS,
@@ -119,7 +120,8 @@ def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
 
 
 def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
-    """All rounds: the catalogue; where it does not suffice, what the data hardly excite, since an
+    """All rounds: the catalogue; formulas in place of what it found, and beside one that is better
+    the catalogue once more; where that does not suffice, what the data hardly excite, since an
     effect may be what keeps them from it (a rough wall, on which nothing slips); then formulas."""
     settings = bench.settings
     base = current = fit_well(bench, effects)
@@ -127,9 +129,11 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     find_confusions(bench, base)
     _tell_adequacy(bench, "the model as it is", before)
     variants: list[Variant] = []
-    close = ()
-    stages = ((settings.catalogue, True), (settings.catalogue, False), (FORMULAS, True))
-    for stage, (pool, excited) in enumerate(stages):
+    close, asked = (), False
+    stages = [(settings.catalogue, True), (settings.catalogue, False), (FORMULAS, True)]
+    stage = 0
+    while stage < len(stages):
+        pool, excited = stages[stage]
         while len(current.effects) - bench.given < settings.most_effects:
             first = len(current.effects) == bench.given
             adequate = bench.adequacy(current).adequate(0.05)
@@ -151,8 +155,15 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if found.best is None:
                 break
             close, current = found.close, pruned(bench, found.best)
+        if stage == 0 and not asked:
+            asked, found_so_far = True, current
+            current = outdone(bench, base, current, _explains(bench, current))
+            if current.names != found_so_far.names:
+                close = ()
+                continue
         if _explains(bench, current):
             break
+        stage += 1
     if current is not base:
         current = fitted_out(bench, current)
     after = bench.adequacy(current)

@@ -12,7 +12,7 @@ import torch
 
 from eval.table.__main__ import KEY, Table, make_table, plan, read_cells
 from eval.table.cells import top_particles
-from eval.table.summary import Row, bootstrap, compare, curves, summarise
+from eval.table.summary import Row, bootstrap, compare, curve_rows, curves, summarise
 from tpcd.belief import EstimatorSettings, SamplerSettings
 from tpcd.belief.belief import prior_belief
 from tpcd.errors import FileError
@@ -78,6 +78,8 @@ def test_curves_follow_the_moves() -> None:
     moves, errors = curves(CELLS, "mujoco")["default / random"]
     assert moves.tolist() == [1, 2]
     np.testing.assert_allclose(errors, [80.0, 16.0])
+    (row,) = (r for r in curve_rows(CELLS) if r["row"] == "default / random")
+    assert row["truth"] == "mujoco" and [row["1"], row["2"]] == pytest.approx([80.0, 16.0])
 
 
 def test_bootstrap_draws_whole_objects() -> None:
@@ -128,6 +130,8 @@ def test_the_quick_table_scores_every_cell_and_goes_on_after_a_stop(tmp_path: Pa
     # After four moves the paper's filter, made for errors of centimetres, is far behind.
     assert rows["default / active"]["x_mm"] < rows["paper / random"]["x_mm"]
     assert results["comparisons"][0]["pairs"] == 2
+    learnt = {row["row"]: row for row in results["curves"]}
+    assert set(learnt) == set(rows) and set(learnt["default / active"]) >= {"1", "2", "3", "4"}
     for name in ("quasistatic-curves", "quasistatic-objects"):
         assert (config.out / "figures" / f"{name}.png").stat().st_size > 5000
     keys = {tuple(row[name] for name in KEY) for row in read_cells(config.out)}

@@ -37,6 +37,14 @@ ROWS = (
     "default/active",
     "default/expert",
 )
+OTHERS = (
+    "default / random",
+    "default / grid",
+    "default / expert",
+    "default / lookahead",
+    "paper / grid",
+)
+"""What our active policy is compared with, cell by cell."""
 QUICK_ROWS = ("paper/random", "default/random", "default/active")
 KEY = ("truth", "object", "seed", "estimator", "policy")
 """What tells cells apart."""
@@ -206,7 +214,7 @@ def _report(config: Table, folder: Path) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
     from eval.table.pages import draw_summary
-    from eval.table.summary import compare, printed, summarise
+    from eval.table.summary import compare, curve_rows, printed, summarise
     from tpcd.results import format_table, write_results
 
     keys = {cell.key for cell in plan(config)}
@@ -215,19 +223,18 @@ def _report(config: Table, folder: Path) -> None:
     if not cells:
         raise ValueError(f"all {len(failed)} cells failed; see the lines of {folder}/cells-*.jsonl")
     table = summarise(cells)
-    pairs = [
-        line
-        for other in ("default / random", "default / grid", "default / expert", "paper / grid")
-        for line in compare(cells, "default / active", other)
-    ]
+    pairs = [line for other in OTHERS for line in compare(cells, "default / active", other)]
     text = format_table([printed(row) for row in table])
     paired = format_table(pairs, formats=dict.fromkeys(("x, z", "F", "tau"), ".2f"))
+    curves = curve_rows(cells)
+    learnt = format_table(curves, formats={m: ".3g" for row in curves for m in row if m.isdigit()})
+    text += f"\n\nmean error of x and z [mm] after so many moves:\n{learnt}"
     print(f"{text}\n\nratios of mean errors, with 90 % intervals:\n{paired}\n\n{PAPER_NOTE}")
     with SummaryWriter(folder / "tensorboard" / "table") as writer:
         writer.add_text("table", f"```\n{text}\n\n{paired}\n```\n\n{PAPER_NOTE}")
         draw_summary(cells, folder / "figures", writer)
-    write_results(folder, table, seeds=config.seeds, comparisons=pairs, note=PAPER_NOTE,
-                  cells=len(cells), failed=failed)  # fmt: skip
+    write_results(folder, table, seeds=config.seeds, comparisons=pairs, curves=curves,
+                  note=PAPER_NOTE, cells=len(cells), failed=failed)  # fmt: skip
     for cell in failed:
         print(f"failed: {', '.join(map(str, cell))}", file=sys.stderr)
     print(f"results in {folder}")

@@ -128,6 +128,15 @@ def curves(cells: Sequence[Row], truth: str) -> dict[str, tuple[Array, Array]]:
     return found
 
 
+def curve_rows(cells: Sequence[Row]) -> list[Row]:
+    """The curves of all truths as a table."""
+    return [
+        {"truth": truth, "row": name} | {str(m): float(e) for m, e in zip(*curve, strict=True)}
+        for truth in dict.fromkeys(row["truth"] for row in cells)
+        for name, curve in curves(cells, truth).items()
+    ]
+
+
 def bootstrap(
     values: Float[Array, "n ..."],
     objects: Sequence[str],

@@ -16,6 +16,7 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy import naming, search
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
+from tpcd.discrepancy.diagnosis import Alternative
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
 from tpcd.discrepancy.naming import Round, Workbench
 from tpcd.discrepancy.screening import Glance
@@ -86,12 +87,17 @@ def test_the_catalogue_is_asked_once_more_beside_a_formula(
 
     def named(bench: Workbench, current: Fit, pool, adequate: bool, excited: bool) -> Round:
         asked.append((current.names, len(pool)))
-        found = None if current.effects else fit_model(bench.question, (effect,), (0,))
-        return Round(current, found)
+        if current.effects:
+            return Round(current)
+        close = (Alternative((effect.name, "floor_tilt"), 1.0, ""),)
+        return Round(current, fit_model(bench.question, (effect,), (0,)), close)
 
-    def swapped(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Fit:
-        assert base.effects == () and current.effects == (effect,) and explained
-        return fit_model(bench.question, (formula,), (0,))
+    def swapped(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round:
+        assert base.effects == () and explained
+        if current.effects == (formula,):
+            return Round(current)
+        assert current.effects == (effect,)
+        return Round(current, fit_model(bench.question, (formula,), (0,)))
 
     monkeypatch.setattr(search, "name_one", named)
     monkeypatch.setattr(search, "outdone", swapped)

@@ -33,7 +33,7 @@ def modelled(hidden: dict[str, dict[str, float]], friction: float) -> np.ndarray
 def test_a_wave_is_a_rippled_floor() -> None:
     height, length = 0.001, 0.08
     ripple = {"floor_ripple": {"height": height, "length": length}}
-    wave = {"floor_height ~ wave": {"height": height, "length": length, "shift": 0.0}}
+    wave = {"floor_height ~ wave": {"sine": height, "length": length}}
     true = follow(ripple, *SLIDES, vertices=WEDGE, friction=0.2)
     ours = modelled(wave, 0.2)
     x, z = np.array([lowest(WEDGE, row) for row in ours]).T

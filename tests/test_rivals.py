@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -10,10 +12,12 @@ from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import rivals
+from tpcd.discrepancy import naming, rivals
+from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
+from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
-from tpcd.discrepancy.naming import Workbench
+from tpcd.discrepancy.naming import Round, Workbench
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings
@@ -68,7 +72,8 @@ def test_a_law_of_place_takes_the_place_of_another_wall_and_not_of_a_true_one(
     base = fit_model(bench.question, (), (0, 1))
     current = fit_model(bench.question, (WALL,), (0, 1), start=(base,))
     assert current.log_evidence > base.log_evidence + SETTINGS.least_gain  # either would be named
-    assert outdone(bench, base, current, True).effects == (found,)
+    round_ = outdone(bench, base, current, True)
+    assert (round_.best or round_.base).effects == (found,) and round_.close == ()
     if found is FIELD:
         (told_of,) = bench.candidates
         assert told_of.name == FIELD.name and told_of.gain > SETTINGS.least_gain
@@ -76,65 +81,149 @@ def test_a_law_of_place_takes_the_place_of_another_wall_and_not_of_a_true_one(
         assert any(told_of.outcome in line for line in told)
 
 
+class Stand:
+    """Fits and looks with evidence that is made up."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, given: int = 0) -> None:
+        bench = bench_of(recorded("quasistatic", {}), [])
+        self.bench = replace(bench, given=given)
+        self.evidence: dict[tuple[str, ...], float] = {}
+        self.looks: dict[tuple[str, ...], float] = {}
+        self.refitted: dict[tuple[str, ...], float] = {}
+        self.adequate = True
+        monkeypatch.setattr(rivals, "fit_model", self.fitted)
+        monkeypatch.setattr(rivals, "looked_closer", self.closer)
+        monkeypatch.setattr(rivals, "pruned", lambda bench, fit: fit)
+        monkeypatch.setattr(rivals, "glance", self.look)
+        monkeypatch.setattr(naming, "lower_bound", lambda *_: 1.0)
+        monkeypatch.setattr(naming, "held_out_scores", lambda *_: torch.zeros(5))
+        monkeypatch.setattr(Workbench, "adequacy", self.left)
+
+    def fit(self, names: tuple[str, ...], value: float) -> Fit:
+        own = tuple(find_effect(name) for name in names)
+        return Fit(own, self.bench.question.step, self.bench.question.scene, (value, value), ())
+
+    def fitted(self, question: Question, own, *_, **__) -> Fit:
+        names = tuple(effect.name for effect in own)
+        return self.fit(names, self.evidence.get(names, 0.0))
+
+    def closer(self, bench: Workbench, current: Fit, near: list[Fit], seeds) -> tuple:
+        def again(fit: Fit) -> Fit:
+            return self.fit(fit.names, self.refitted.get(fit.names, fit.log_evidence))
+
+        return again(current), [again(fit) for fit in near]
+
+    def look(self, question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
+        return Glance(
+            effect, self.looks.get((*base.names, effect.name), 30.0), (0.1,), torch.zeros(9)
+        )
+
+    def left(self, fit: Fit) -> Adequacy:
+        return Adequacy(0.01, 0.5, 0.5, ()) if self.adequate else Adequacy(0.3, 1e-9, 0.5, ())
+
+    def ask(self, effects: tuple[str, ...], explained: bool = True) -> Round:
+        base = self.fit(effects[: self.bench.given], 50.0)
+        return outdone(self.bench, base, self.fit(effects, 100.0), explained)
+
+
 @pytest.mark.parametrize(
-    ("effects", "lead", "taken"),
+    ("effects", "left", "lead", "taken"),
     [
-        (("wall_friction",), 5.9, False),
-        (("wall_friction",), 6.1, True),
-        (("wall_friction", "directional_friction"), 0.1, True),
-        (("wall_friction", "directional_friction"), -0.1, False),
-        (("wall_friction", "force_bias"), 5.9, False),
-        (("force_bias",), 100.0, False),  # no formula is of its site
-        ((), 100.0, False),
+        (("wall_friction",), (), 5.9, False),
+        (("wall_friction",), (), 6.1, True),
+        (("wall_friction", "directional_friction"), (), 0.1, True),
+        (("wall_friction", "directional_friction"), (), -0.1, False),
+        (("wall_friction", "force_bias"), ("force_bias",), 5.9, False),
+        (("wall_friction", "force_bias"), ("force_bias",), 6.1, True),
+        (("wall_friction", "load_friction"), ("load_friction",), 6.1, True),
+        (("wall_friction", "load_friction"), ("load_friction",), 5.9, False),
+        (("force_bias",), (), 100.0, False),  # no formula is of its site
+        ((), (), 100.0, False),
     ],
 )
 def test_a_formula_counts_for_two_effects(
-    effects: tuple[str, ...], lead: float, taken: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = bench_of(recorded("quasistatic", {}), [])
-    prior = bench.question.scene
-
-    def fit(names: tuple[str, ...], evidence: float) -> Fit:
-        own = tuple(find_effect(name) for name in names)
-        return Fit(own, bench.question.step, prior, (evidence,), ())
-
-    def fitted(question: Question, own, *_, **__) -> Fit:
-        return fit(tuple(effect.name for effect in own), 100.0 + lead)
-
-    monkeypatch.setattr(rivals, "fit_model", fitted)
-    monkeypatch.setattr(rivals, "fitted_again", lambda bench, fit, *_: fit)
-    monkeypatch.setattr(rivals, "pruned", lambda bench, fit: fit)
-    seen = Glance(FIELD, 100.0, (0.1,), torch.zeros(9))
-    monkeypatch.setattr(rivals, "glance", lambda question, base, effect, fresh: seen)
-    current = fit(effects, 100.0)
-    after = outdone(bench, fit((), 50.0), current, True)
-    assert (FIELD.name in after.names) == taken
-    assert ("force_bias" in after.names) == ("force_bias" in effects)
-    if not taken:
-        assert after is current
+    effects: tuple[str, ...], left: tuple[str, ...], lead: float, taken: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    stand = Stand(monkeypatch)
+    stand.evidence = {(*left, FIELD.name): 100.0 + lead}
+    stand.looks = {(*left, FIELD.name): 100.0}
+    found = stand.ask(effects)
+    assert (found.best is not None) == taken
+    assert found.base.names == effects
+    if found.best is not None:
+        assert found.best.names == (*left, FIELD.name)
 
 
-@pytest.mark.parametrize(("explained", "found"), [(True, "force_bias"), (False, WAVE.name)])
+@pytest.mark.parametrize("explained", [True, False])
 def test_where_something_is_left_every_formula_is_asked_in_place_of_all_effects(
-    explained: bool, found: str, monkeypatch: pytest.MonkeyPatch
+    explained: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No formula is of the site of the effect; the quick look sees none that is worth a fit."""
-    bench = bench_of(recorded("quasistatic", {}), [])
-    evidence = {(WAVE.name,): 120.0, (STEP.name,): 110.0}
+    stand = Stand(monkeypatch)
+    stand.evidence = {(WAVE.name,): 120.0, (STEP.name,): 110.0}
+    stand.looks = dict.fromkeys(stand.evidence, 40.0)
+    found = stand.ask(("force_bias",), explained)
+    assert (found.best is not None) == (not explained)
+    assert [c.name for c in stand.bench.candidates] == ([] if explained else [STEP.name, WAVE.name])
 
-    def fit(own: tuple[Effect, ...], value: float) -> Fit:
-        return Fit(own, bench.question.step, bench.question.scene, (value,), ())
 
-    def fitted(question: Question, own, *_, **__) -> Fit:
-        return fit(tuple(own), evidence[tuple(effect.name for effect in own)])
+def test_what_was_found_is_fitted_again_before_it_gives_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stand = Stand(monkeypatch)
+    stand.evidence, stand.looks = {(FIELD.name,): 140.0}, {(FIELD.name,): 120.0}
+    stand.refitted = {(WALL.name,): 139.0}
+    found = stand.ask((WALL.name,))
+    assert found.best is None and found.base.log_evidence == pytest.approx(139.0)
+    # The formula is no more likely, but it explains the data as well.
+    assert [one.names for one in found.close] == [(FIELD.name,)]
 
-    def look(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
-        return Glance(effect, 40.0 if effect in (WAVE, STEP) else 30.0, (0.1,), torch.zeros(9))
 
-    monkeypatch.setattr(rivals, "fit_model", fitted)
-    monkeypatch.setattr(rivals, "fitted_again", lambda bench, fit, *_: fit)
-    monkeypatch.setattr(rivals, "pruned", lambda bench, fit: fit)
-    monkeypatch.setattr(rivals, "glance", look)
-    after = outdone(bench, fit((), 50.0), fit((find_effect("force_bias"),), 100.0), explained)
-    assert after.names == (found,)
-    assert [c.name for c in bench.candidates] == ([] if explained else [STEP.name, WAVE.name])
+def test_a_formula_that_leaves_something_takes_the_place_of_nothing_that_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stand = Stand(monkeypatch)
+    stand.evidence, stand.looks = {(FIELD.name,): 140.0}, {(FIELD.name,): 120.0}
+    stand.adequate = False
+    assert stand.ask((WALL.name,)).best is None
+    stand.adequate = True
+    assert stand.ask((WALL.name,)).best is not None
+
+
+def test_what_gives_way_stays_in_the_report_and_what_was_asked_beside_it_goes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stand = Stand(monkeypatch)
+    stand.evidence, stand.looks = {(FIELD.name,): 140.0}, {(FIELD.name,): 120.0}
+    stand.bench.candidates[:] = [
+        Candidate(WALL.name, 1, 50.0, (), "accepted: gain 50.0"),
+        Candidate("floor_tilt", 2, 1.0, (), "rejected: gain 1.0"),
+    ]
+    stand.ask((WALL.name,))
+    first, second = stand.bench.candidates
+    assert first.outcome == f"accepted: gain 50.0; gave way to {FIELD.name}"
+    assert (second.name, second.round) == (FIELD.name, 1)
+
+
+def test_effects_that_were_given_are_kept_and_asked_of_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stand = Stand(monkeypatch, given=1)
+    stand.evidence = {(FIELD.name, WAVE.name): 200.0, (FIELD.name, FIELD.name): 300.0}
+    stand.looks = {(FIELD.name, FIELD.name): 150.0, (FIELD.name, WAVE.name): 140.0}
+    found = stand.ask((FIELD.name, "floor_tilt"))
+    assert found.best is not None and found.best.names == (FIELD.name, WAVE.name)
+
+
+def test_a_formula_that_fails_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand = Stand(monkeypatch)
+    stand.looks = {(FIELD.name,): 120.0}
+
+    def failing(*_, **__) -> Fit:
+        raise RuntimeError("no such luck")
+
+    monkeypatch.setattr(rivals, "fit_model", failing)
+    found = stand.ask((WALL.name, "force_bias"), explained=False)
+    assert found.best is None and found.base.names == (WALL.name, "force_bias")
+    assert any("no such luck" in note for note in stand.bench.notes)

@@ -228,7 +228,7 @@ def _report(config: Table, folder: Path) -> None:
     paired = format_table(pairs, formats=dict.fromkeys(("x, z", "F", "tau"), ".2f"))
     curves = curve_rows(cells)
     learnt = format_table(curves, formats={m: ".3g" for row in curves for m in row if m.isdigit()})
-    text += f"\n\nmean error of x and z [mm] after so many moves:\n{learnt}"
+    text += f"\n\nerror of x and z [mm] after so many moves, without the closing draws:\n{learnt}"
     print(f"{text}\n\nratios of mean errors, with 90 % intervals:\n{paired}\n\n{PAPER_NOTE}")
     with SummaryWriter(folder / "tensorboard" / "table") as writer:
         writer.add_text("table", f"```\n{text}\n\n{paired}\n```\n\n{PAPER_NOTE}")

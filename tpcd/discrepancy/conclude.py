@@ -15,7 +15,7 @@ from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors, t
 from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.variants import NUMERICS, Variant
-from tpcd.effects.formula import FORMULAS
+from tpcd.effects.formula import FORMULA_NAMES
 from tpcd.random import stream
 
 HALF = 0.5
@@ -139,13 +139,12 @@ def _verdict(
         return "unknown_remains", f"something else is missing: {where}{besides}"
     if not effects:
         return "nothing_missing", "the model explains the data; nothing is missing"
-    formulas = {formula.name for formula in FORMULAS}
-    if any(effect.name in formulas for effect in effects):
-        return "formula", told
     if found.close:
         others = " or ".join(" + ".join(a.names) for a in found.close)
-        return "ambiguous", f"{told}; {others} would explain the data as well"
-    return "named", told
+        told += f"; {others} would explain the data as well"
+    if any(effect.name in FORMULA_NAMES for effect in effects):
+        return "formula", told
+    return "ambiguous" if found.close else "named", told
 
 
 def _shape_line(belief: Belief, variants: Sequence[Variant]) -> str:

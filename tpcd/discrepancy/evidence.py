@@ -207,11 +207,18 @@ def fit_stream(question: Question, effects: Sequence[Effect], seed: int) -> torc
 
 
 def carried(
-    fit: Fit, prior: ParameterPrior, generator: torch.Generator, count: int = _REMEMBERED
+    fit: Fit,
+    prior: ParameterPrior,
+    generator: torch.Generator,
+    count: int = _REMEMBERED,
+    repeat: bool = False,
 ) -> Float[Tensor, "k s"]:
-    """Places of a fit in the coordinates of another model: effects that both have are kept,
-    new ones start at their null value and at draws from their prior."""
+    """At most `count` places of a fit in the coordinates of another model, with `repeat` so many
+    in any case: effects that both have are kept, new ones start at their null value and at draws
+    from their prior."""
     best = fit.cloud.weights.argsort(descending=True)[:count]
+    if repeat:  # two in a row, so that both kinds of start are made of each
+        best = best[(torch.arange(count) // 2) % len(best)]
     places = fit.cloud.positions[best]
     scene = prior.scene_dimension
     columns = [_rescaled(places[:, :scene], fit.prior, prior)]

@@ -26,6 +26,7 @@ from tpcd.discrepancy.settings import (
     CLEAR,
     CLOSER,
     CLOSER_SEEDS,
+    FORMULA_COUNTS,
     FRESH,
     IMPROVED,
     SURE,
@@ -36,6 +37,7 @@ from tpcd.discrepancy.settings import (
     DiagnosisSettings,
 )
 from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, WIDE_SHAPE, Variant
+from tpcd.effects.formula import FORMULA_NAMES
 from tpcd.effects.protocol import Effect
 from tpcd.random import stream
 
@@ -68,6 +70,11 @@ class Workbench:
     def excited(self, effects: Sequence[Effect]) -> list[Effect]:
         """Those of the effects that the data could show."""
         return [effect for effect in effects if not self.coverage.missing(effect.needs)]
+
+    def price(self, effects: Sequence[Effect]) -> float:
+        """The gain of log evidence that these have to bring."""
+        counts = sum(FORMULA_COUNTS if effect.name in FORMULA_NAMES else 1 for effect in effects)
+        return counts * self.settings.least_gain
 
     def adequacy(self, fit: Fit) -> Adequacy:
         """What a model leaves."""
@@ -160,7 +167,7 @@ def name_one(
             near.sort(key=lambda fit: -fit.log_evidence)
     lead = near[0].log_evidence - current.log_evidence if near else -math.inf
     if UNDECIDED[adequate] < lead < CLEAR:
-        current, near = _looked_closer(bench, current, near)
+        current, near = looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)
         gain = (g if full is None else full).log_evidence - current.log_evidence
@@ -209,7 +216,7 @@ def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
     for effect in own[:-1] if but_last else own:
         less = tuple(e for e in fit.effects if e is not effect)
         other = fit_model(bench.question, less, (0, 1), start=(fit,))
-        if fit.log_evidence - other.log_evidence < bench.settings.least_gain:
+        if fit.log_evidence - other.log_evidence < bench.price((effect,)):
             bench.tell(f"{effect.name} is no longer needed")
             fit = other
     return fit
@@ -241,7 +248,9 @@ def _glances(
     return sorted(glances, key=lambda g: -g.log_evidence)
 
 
-def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit, list[Fit]]:
+def looked_closer(
+    bench: Workbench, current: Fit, near: list[Fit], seeds: Sequence[int] = CLOSER_SEEDS
+) -> tuple[Fit, list[Fit]]:
     """The base model and the best candidate with a larger search, each from where both arrived:
     where they are close, what the search over shapes has missed may decide. On while one of them
     finds much more than before, since the search is still climbing then."""
@@ -252,7 +261,7 @@ def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit
             sampler, fresh_modes=CLOSER * sampler.fresh_modes, draws=CLOSER * sampler.draws
         ),
     )
-    for seed in CLOSER_SEEDS:
+    for seed in seeds:
         both, others = (current, near[0]), near[1:]
         before = [max(fit.by_seed) for fit in both]
         current, best = (fitted_again(bench, fit, seed, both, question=wide) for fit in both)
@@ -262,19 +271,34 @@ def _looked_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit
     return current, near
 
 
-def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:
-    """Whether the best of the candidates is accepted, and what comes close to it."""
-    best = near[0]
+def stands(
+    bench: Workbench, best: Fit, current: Fit, price: float, number: int
+) -> tuple[bool, str]:
+    """Whether a model gains the price over another, on two seeds and, where that is not much, on
+    blocks held out; and what it gains."""
     gain = best.log_evidence - current.log_evidence
-    agreed = sum(evidence > current.log_evidence for evidence in best.by_seed) >= 2
-    accepted = gain >= bench.settings.least_gain and agreed
+    least = current.log_evidence + min(price, 0.0)
+    accepted = gain >= price and sum(evidence > least for evidence in best.by_seed) >= 2
     reason = f"gain {gain:.1f}"
-    if accepted and gain < SURE:
+    if accepted and price > 0 and gain < SURE:
         own, base = (held_out_scores(bench.question, fit) for fit in (best, current))
         generator = stream(bench.settings.seed, 77, number)
         bound = lower_bound(own - base, generator, VETO_LEVEL)
         reason += f", held-out gain at least {bound:+.2f} a transition"
         accepted = bound > 0
+    return accepted, reason
+
+
+def alternative(fit: Fit, without: Fit) -> Alternative:
+    """A model that comes close to the one that is taken."""
+    motion = "; or ".join(MOTIONS.get(need, need) for need in fit.effects[-1].needs)
+    return Alternative(fit.names, fit.log_evidence - without.log_evidence, motion)
+
+
+def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:
+    """Whether the best of the candidates is accepted, and what comes close to it."""
+    best = near[0]
+    accepted, reason = stands(bench, best, current, bench.price(best.effects[-1:]), number)
     outcome = f"{'accepted' if accepted else 'rejected'}: {reason}"
     place = (best.names[-1], number)
     bench.candidates[:] = [
@@ -282,11 +306,7 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
     ]
     bench.tell(f"round {number}: {best.names[-1]} {outcome}")
     close = tuple(
-        Alternative(
-            fit.names,
-            fit.log_evidence - current.log_evidence,
-            "; or ".join(MOTIONS.get(need, need) for need in fit.effects[-1].needs),
-        )
+        alternative(fit, current)
         for fit in near[1:]
         if fit.log_evidence > best.log_evidence - AMBIGUOUS
     )

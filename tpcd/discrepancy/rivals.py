@@ -2,29 +2,35 @@
 
 Friction that grows along the floor is another friction on the wall too, so that an effect is
 accepted, and may leave too little for anybody to ask on. Formulas are therefore also asked to
-explain the data instead of the effects that were found at their site, and where something is left
-instead of all. Each effect has to gain the least that it is accepted for, and a formula, which is
-less likely beforehand, twice as much.
+explain the data instead of the effects at their site, one by one and together, and where
+something is left any formula instead of all effects. Each effect has to gain the least that it is
+accepted for, and a formula, which is less likely beforehand, more (`Workbench.price`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import Fit, fit_model
-from tpcd.discrepancy.naming import Workbench, each_of, fitted_again, pruned
+from tpcd.discrepancy.naming import (
+    Round,
+    Workbench,
+    alternative,
+    each_of,
+    looked_closer,
+    pruned,
+    stands,
+)
 from tpcd.discrepancy.screening import Glance, glance
-from tpcd.discrepancy.settings import CLOSER_SEEDS, FRESH, WITHIN
+from tpcd.discrepancy.settings import AMBIGUOUS, FRESH, RIVAL_SEEDS, WITHIN
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 
-COUNTS = 2
-"""Effects that a formula counts for."""
-TRIED = 2
-"""Formulas that get a full fit where the effects leave something, whatever the quick look says:
-with effects that are not there, the scene may have gone astray."""
+FULL_FITS = 2
+"""Formulas that are fitted in full where the effects leave something, whatever the quick look
+says: with effects that are not there, the scene may have gone astray."""
 
 
 @dataclass(frozen=True)
@@ -33,95 +39,135 @@ class _Rival:
 
     seen: Glance
     without: Fit
-    instead_of: tuple[str, ...]
-    asked: float
+    instead_of: tuple[Effect, ...]
+    price: float
     """How much more it has to explain than the model with those effects."""
 
+    @property
+    def formula(self) -> Effect:
+        """What takes their place."""
+        return self.seen.effect
 
-@dataclass(frozen=True)
-class _Tried:
-    """A rival fitted in full."""
-
-    rival: _Rival
-    fit: Fit
-    surplus: float
-    """How much more than asked it explains."""
-
-
-def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Fit:
-    """The model with a formula in place of effects, where one explains the data so much better;
-    else the model as it is, of which `explained` says whether it leaves nothing. `base` is the
-    model without effects of its own."""
-    rivals = [
-        rival
-        for without, formulas, names in _asked(bench, base, current, explained)
-        for rival in _looked_at(bench, without, formulas, names)
-    ]
-    rivals.sort(key=lambda rival: rival.asked - rival.seen.log_evidence)
-    if explained:
-        bar = current.log_evidence - WITHIN
-        rivals = [one for one in rivals[:1] if one.seen.log_evidence - one.asked > bar]
-    tried = [one for rival in rivals[:TRIED] if (one := _fitted(bench, current, rival))]
-    best = max(tried, key=lambda one: one.surplus, default=None)
-    taken = best is not None and best.surplus >= 0
-    for one in tried:
-        _note(bench, one, taken and one is best)
-    return pruned(bench, best.fit) if best is not None and taken else current
+    @property
+    def worth(self) -> float:
+        """What the quick look sees beyond the price."""
+        return self.seen.log_evidence - self.price
 
 
-def _asked(
+def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round:
+    """The model with a formula in place of effects, where one explains the data so much better.
+
+    `base` is the model without effects of its own; `explained` says whether the current model
+    leaves nothing. A round's base is the current model, perhaps better fitted.
+    """
+    fits = []
+    for rival in _chosen(bench, base, current, explained):
+        fits += each_of(
+            bench, [rival.formula], _number(bench, rival), _fit_of(bench, current, rival)
+        )
+    best = max(fits, key=lambda one: one[1].log_evidence - one[0].price, default=None)
+    if best is None:
+        return Round(current)
+    rival, fit = best
+    if fit.log_evidence - rival.price > current.log_evidence - WITHIN:
+        current, (fit,) = looked_closer(bench, current, [fit], RIVAL_SEEDS)
+    taken, reason = stands(bench, fit, current, rival.price, _number(bench, rival))
+    if taken and explained and bench.settings.adequacy:
+        taken = bench.adequacy(fit).adequate(bench.settings.level)
+        reason += "" if taken else ", but it leaves something"
+    for other, its in fits:
+        if other is not rival:
+            _note(bench, other, its, False, f"gain {its.log_evidence - current.log_evidence:.1f}")
+    _note(bench, rival, fit, taken, reason)
+    lead = fit.log_evidence - current.log_evidence
+    if not taken:
+        close = (alternative(fit, rival.without),) if lead > -AMBIGUOUS else ()
+        return Round(current, None, close)
+    close = (alternative(current, rival.without),) if lead < AMBIGUOUS else ()
+    return Round(current, pruned(bench, fit), close)
+
+
+def _chosen(bench: Workbench, base: Fit, current: Fit, explained: bool) -> list[_Rival]:
+    """The rivals that are worth a full fit, each formula in the one place where it does best."""
+    best: dict[str, _Rival] = {}
+    for without, formulas, instead_of in _questions(bench, base, current, explained):
+        for rival in _looked_at(bench, without, formulas, instead_of):
+            known = best.get(rival.formula.name)
+            if known is None or rival.worth > known.worth:
+                best[rival.formula.name] = rival
+    rivals = sorted(best.values(), key=lambda rival: -rival.worth)
+    if not explained:
+        return rivals[:FULL_FITS]
+    return [one for one in rivals[:1] if one.worth > current.log_evidence - WITHIN]
+
+
+def _questions(
     bench: Workbench, base: Fit, current: Fit, explained: bool
-) -> Iterator[tuple[Fit, list[Effect], tuple[str, ...]]]:
-    """Models without some effects, the formulas that may stand for those, and their names."""
+) -> Iterator[tuple[Fit, list[Effect], tuple[Effect, ...]]]:
+    """Models without some effects, the formulas that may stand for those, and these effects."""
     own = current.effects[bench.given :]
-    excited = [formula for formula in bench.excited(FORMULAS) if formula not in own]
-    sites = tuple(dict.fromkeys(effect.site for effect in own))
-    groups = [((site,), [f for f in excited if f.site == site]) for site in sites]
+    excited = [f for f in bench.excited(FORMULAS) if f.name not in current.names]
+    sites = dict.fromkeys(effect.site for effect in own)
+    together = [tuple(effect for effect in own if effect.site == site) for site in sites]
+    parts = [(effect,) for effect in own] + together
     if own and not explained:
-        everywhere = (sites, excited)
-        groups = [everywhere] if len(sites) == 1 else [*groups, everywhere]
-    for among, formulas in groups:
-        names = tuple(effect.name for effect in own if effect.site in among)
-        rest = tuple(e for e in current.effects if e not in own or e.site not in among)
-        if formulas and rest == base.effects:
-            yield base, formulas, names
-        elif formulas:
-            start = (base, current)
-            yield fit_model(bench.question, rest, (0, 1), start=start), formulas, names
+        parts.append(own)
+    for part in dict.fromkeys(parts):
+        anywhere = part == own and not explained
+        formulas = [f for f in excited if anywhere or f.site == part[0].site]
+        rest = tuple(effect for effect in current.effects if effect not in part)
+        if not formulas:
+            continue
+        if rest == base.effects:
+            yield base, formulas, part
+            continue
+        try:
+            yield fit_model(bench.question, rest, (0, 1), (base, current)), formulas, part
+        except Exception as error:  # a failure must not cost what was found
+            names = " and ".join(effect.name for effect in part)
+            bench.warn(f"the model without {names} failed: {type(error).__name__}: {error}")
 
 
 def _looked_at(
-    bench: Workbench, without: Fit, formulas: list[Effect], names: tuple[str, ...]
+    bench: Workbench, without: Fit, formulas: Sequence[Effect], instead_of: tuple[Effect, ...]
 ) -> list[_Rival]:
     fresh = FRESH[False] if bench.settings.from_prior else 0
-    asked = bench.settings.least_gain * (COUNTS - len(names))
     number = len(without.effects) - bench.given + 1
-    seen = each_of(
-        bench, formulas, number, lambda formula: glance(bench.question, without, formula, fresh)
-    )
-    return [_Rival(one, without, names, asked) for one in seen]
+    seen = each_of(bench, formulas, number, lambda f: glance(bench.question, without, f, fresh))
+    return [
+        _Rival(one, without, instead_of, bench.price((one.effect,)) - bench.price(instead_of))
+        for one in seen
+    ]
 
 
-def _fitted(bench: Workbench, current: Fit, rival: _Rival) -> _Tried | None:
-    """The model with the formula fitted in full; None where that fails."""
-    formula, start = rival.seen.effect, (rival.without, current)
-    effects, places = (*rival.without.effects, formula), rival.seen.place[None]
-    try:
-        fit = fit_model(bench.question, effects, (0, 1), start=start, places=places)
-    except Exception as error:  # a failure must not cost what was found
-        bench.warn(f"{formula.name} failed: {type(error).__name__}: {error}")
-        return None
-    if abs(fit.log_evidence - current.log_evidence - rival.asked) < WITHIN:
-        both = (current, fit)
-        current, fit = (fitted_again(bench, one, CLOSER_SEEDS[0], both) for one in both)
-    return _Tried(rival, fit, fit.log_evidence - current.log_evidence - rival.asked)
+def _fit_of(bench: Workbench, current: Fit, rival: _Rival):
+    def fitted(formula: Effect) -> tuple[_Rival, Fit]:
+        effects, start = (*rival.without.effects, formula), (rival.without, current)
+        places = rival.seen.place[None]
+        return rival, fit_model(bench.question, effects, (0, 1), start=start, places=places)
+
+    return fitted
 
 
-def _note(bench: Workbench, tried: _Tried, taken: bool) -> None:
-    rival, fit = tried.rival, tried.fit
-    outcome = f"{'accepted' if taken else 'rejected'} in place of {' and '.join(rival.instead_of)}"
-    outcome += f": {tried.surplus + rival.asked:+.1f}, {rival.asked:.0f} asked"
+def _number(bench: Workbench, rival: _Rival) -> int:
+    return len(rival.without.effects) - bench.given + 1
+
+
+def _note(bench: Workbench, rival: _Rival, fit: Fit, taken: bool, reason: str) -> None:
+    """Put a rival among the candidates. Where it is taken, what was asked beside the effects that
+    it stands for will be asked anew, and goes."""
+    formula, number = rival.formula.name, _number(bench, rival)
+    names = [effect.name for effect in rival.instead_of]
+    outcome = f"{'accepted' if taken else 'rejected'} in place of {' and '.join(names)}: {reason}"
+    outcome += f" of {rival.price:.0f} asked"
+    if taken:
+        bench.candidates[:] = [
+            replace(c, outcome=f"{c.outcome}; gave way to {formula}")
+            if c.name in names and c.outcome.startswith("accepted")
+            else c
+            for c in bench.candidates
+            if c.round <= number
+        ]
     gain = fit.log_evidence - rival.without.log_evidence
-    number, name = len(fit.effects) - bench.given, rival.seen.effect.name
-    bench.candidates.append(Candidate(name, number, gain, fit.by_seed, outcome))
-    bench.tell(f"{name} {outcome}")
+    bench.candidates.append(Candidate(formula, number, gain, fit.by_seed, outcome))
+    bench.tell(f"{formula} {outcome}")

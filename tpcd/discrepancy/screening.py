@@ -68,9 +68,7 @@ def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _
     generator = fit_stream(question, effects, 0)
     # Two parameters, such as how high a step is and where, are rarely right by chance together.
     count = min(PLACES * len(effects[-1].parameters) ** 2, MOST_PLACES)
-    start = carried(base, prior, generator, count)
-    while len(start) < count:  # a base model may rest on fewer places than that
-        start = torch.cat((start, carried(base, prior, generator, count - len(start))))
+    start = carried(base, prior, generator, count, repeat=count > PLACES)
     if count > PLACES:
         begun, height = climb(target, start, FRESH_ROUNDS)
         start = begun[height.topk(PLACES).indices]

@@ -1,7 +1,8 @@
 """The diagnosis: preflight, fit, locate, name, add and fit again, until nothing is missing.
 
-An absolute test says whether what was found is enough; up to three effects are added, then laws
-that vary with the contact, and what is left after those is said to be unknown.
+An absolute test says whether what was found is enough; up to three effects are added, laws that
+vary with the contact are asked for in their place and beside them, and what is left after those is
+said to be unknown.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import coverage_of
-from tpcd.discrepancy.diagnosis import Diagnosis
+from tpcd.discrepancy.diagnosis import Alternative, Diagnosis
 from tpcd.discrepancy.evidence import TIED, Fit, Question
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import (
@@ -122,14 +123,16 @@ def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
 def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     """All rounds: the catalogue; formulas in place of what it found, and beside one that is better
     the catalogue once more; where that does not suffice, what the data hardly excite, since an
-    effect may be what keeps them from it (a rough wall, on which nothing slips); then formulas."""
+    effect may be what keeps them from it (a rough wall, on which nothing slips); then formulas
+    beside what was found."""
     settings = bench.settings
     base = current = fit_well(bench, effects)
     before = bench.adequacy(base)
     find_confusions(bench, base)
     _tell_adequacy(bench, "the model as it is", before)
     variants: list[Variant] = []
-    close, asked = (), False
+    close: tuple[Alternative, ...] = ()
+    asked: set[tuple[str, ...]] = set()
     stages = [(settings.catalogue, True), (settings.catalogue, False), (FORMULAS, True)]
     stage = 0
     while stage < len(stages):
@@ -155,13 +158,16 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if found.best is None:
                 break
             close, current = found.close, pruned(bench, found.best)
-        if stage == 0 and not asked:
-            asked, found_so_far = True, current
-            current = outdone(bench, base, current, _explains(bench, current))
-            if current.names != found_so_far.names:
-                close = ()
+        explained = _explains(bench, current)
+        if stage < 2 and current.names not in asked and len(current.effects) > bench.given:
+            asked.add(current.names)
+            rival = outdone(bench, base, current, explained)
+            close = rival.close if rival.best else (*close, *rival.close)
+            current = rival.best or rival.base
+            if rival.best:
+                stage = 0
                 continue
-        if _explains(bench, current):
+        if explained:
             break
         stage += 1
     if current is not base:

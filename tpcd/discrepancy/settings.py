@@ -40,6 +40,10 @@ VETO_LEVEL = 0.2
 """Of the bound of the held-out gain. What shows in one stretch of the data alone, such as a push
 that static friction holds, is missed by the bootstrap in a third of its draws, so that a bound
 at 5 % would never let it pass."""
+RIVAL_SEEDS = (33, 34, 35)
+"""Seeds of that for a formula in place of effects."""
+FORMULA_COUNTS = 2
+"""Effects that a formula counts for: it is as much less likely beforehand."""
 FINAL_SEEDS = tuple(range(20, 28))
 """Further seeds of the model that was found, of which two or more are used."""
 FEWEST_DRAWS = 5

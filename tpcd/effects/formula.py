@@ -1,4 +1,4 @@
-"""When no effect of the catalogue suffices: let a number of the simulator vary with a covariate.
+"""What is no effect of the catalogue: a number of the simulator that varies with a covariate.
 
 Each formula is an ordinary effect with units: friction or the height of the floor, as a function
 of something taken at the contact. What it says is a law for these data; why it holds is for
@@ -74,10 +74,10 @@ def _wave(
 ) -> Conditions:
     if outcome is None:
         return conditions
-    height, length, shift = (column(values, i) for i in range(3))
+    sine, cosine, length = (column(values, i) for i in range(3))
     x, number = outcome.place[:, :, FLOOR, 0], 2 * math.pi / length
-    turns = number * x + 2 * math.pi * shift
-    return on_curve(conditions, x, height * turns.sin(), height * number * turns.cos())
+    s, c = (number * x).sin(), (number * x).cos()
+    return on_curve(conditions, x, sine * s + cosine * c, number * (sine * c - cosine * s))
 
 
 def _stiffening(
@@ -93,21 +93,23 @@ def _stiffening(
     return sunk(conditions, FLOOR, sink, rows, outcome)
 
 
-def _friction_formula(name: str, unit: str, most: float, covariate: Covariate) -> DeclaredEffect:
+def _friction_formula(
+    name: str, unit: str, most: float, covariate: Covariate, *needs: str
+) -> DeclaredEffect:
     return DeclaredEffect(
         f"log_friction ~ {name}",
         "contact tangent",
         (EffectParameter("slope", unit, -most, most),),
         _log_friction(covariate),
         f"the logarithm of friction changes by {{0}} with the {name} of the contact",
-        needs=("floor slip",),
+        needs=("floor slip", *needs),
         passes=1,
     )
 
 
 FORMULAS = (
-    _friction_formula("place", "1/m", 20.0, _place),
-    _friction_formula("height", "1/m", 20.0, _height),
+    _friction_formula("place", "1/m", 20.0, _place, "floor places"),
+    _friction_formula("height", "1/m", 20.0, _height, "wall slip"),
     _friction_formula("angle", "1/rad", 5.0, _angle),
     _friction_formula("time", "1", 2.0, _time),
     _friction_formula("slip", "1/m", 20.0, _slip),
@@ -127,15 +129,12 @@ FORMULAS = (
         "floor_height ~ wave",
         "geometry",
         (
-            EffectParameter("height", "m", -0.005, 0.005, shown_unit="mm", shown_factor=1e3),
+            EffectParameter("sine", "m", -0.005, 0.005, shown_unit="mm", shown_factor=1e3),
+            EffectParameter("cosine", "m", -0.005, 0.005, shown_unit="mm", shown_factor=1e3),
             EffectParameter("length", "m", 0.03, 0.15, 0.06, shown_unit="mm", shown_factor=1e3),
-            EffectParameter(
-                "shift", "1", -0.25, 0.25, shown_unit="% of its length", shown_factor=100.0
-            ),
         ),
         _wave,
-        "the floor is a wave of {0} with a length of {1}, which rises through its mean {2} before"
-        " x = 0",
+        "the floor rises by {0} sin(2πx / l) and {1} cos(2πx / l), with l = {2}",
         needs=("floor places",),
         passes=2,
     ),
@@ -150,3 +149,4 @@ FORMULAS = (
     ),
 )
 """Formulas that are tried, in no order."""
+FORMULA_NAMES = frozenset(formula.name for formula in FORMULAS)

@@ -67,10 +67,10 @@ class FloorShape:
     @property
     def is_flat(self) -> bool:
         """Whether one plane will do."""
-        return self.curvature == 0.0 and self.is_bowl
+        return self.curvature == 0.0 and self.is_smooth
 
     @property
-    def is_bowl(self) -> bool:
+    def is_smooth(self) -> bool:
         """Whether it has nothing but a tilt and a curvature."""
         return self.step_height == self.ripple_height == self.bump_height == 0.0
 
@@ -125,7 +125,7 @@ def floor_points(
     close along the outline that the floor enters by 5 µm between them (or every 1 mm), and
     kept if they come near the lowest one at some turn within `LARGEST_TURN` of `angle`.
     """
-    if shape.is_bowl and shape.curvature >= 0.0:
+    if shape.is_smooth and shape.curvature >= 0.0:
         return hull
     bend = abs(shape.curvature) + 6.0 * abs(shape.step_height) / STEP_LENGTH**2
     bend += abs(shape.ripple_height) * shape.ripple_number**2

@@ -24,9 +24,9 @@ from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound, typical_share
 from tpcd.discrepancy.memory import Memory
-from tpcd.discrepancy.naming import Workbench, fitted_again
 from tpcd.discrepancy.report_parts import shown_value
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose, fitted_out
+from tpcd.discrepancy.workbench import Workbench, fitted_again
 from tpcd.effects import find_effect
 from tpcd.effects.protocol import EffectParameter
 from tpcd.errors import RunError
@@ -149,7 +149,7 @@ def test_the_model_found_is_fitted_again_while_the_search_climbs(
             (), StepSettings(), make_prior(shape), (found,), (replace(begin, log_evidence=found),)
         )
 
-    monkeypatch.setattr("tpcd.discrepancy.naming.fit_model", fit_model)
+    monkeypatch.setattr("tpcd.discrepancy.workbench.fit_model", fit_model)
     fit = fitted_out(bench, first)
     assert len(asked) == used == len(set(asked)) and len(fit.by_seed) == used + 1
     assert bool(told) == (draws == 1) == bool(bench.notes)
@@ -165,7 +165,7 @@ def test_a_fit_that_fails_when_made_again_costs_nothing(
     def broken(*_: object, **__: object) -> Fit:
         raise ValueError("no particle explains it")
 
-    monkeypatch.setattr("tpcd.discrepancy.naming.fit_model", broken)
+    monkeypatch.setattr("tpcd.discrepancy.workbench.fit_model", broken)
     assert fitted_again(bench, fit, 1, ()) is fit
     assert told == [
         "warning: floor_tilt failed when fitted again: ValueError: no particle explains it"

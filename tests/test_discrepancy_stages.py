@@ -18,9 +18,9 @@ from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Alternative
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
-from tpcd.discrepancy.naming import Round, Workbench
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
+from tpcd.discrepancy.workbench import Round, Workbench
 from tpcd.effects import Effect, find_effect
 from tpcd.effects.formula import FORMULAS
 from tpcd.shape.builtin import builtin_outlines

@@ -12,8 +12,8 @@ from tpcd.belief.prior import make_prior
 from tpcd.discrepancy import conclude
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.evidence import Question, fit_model, posterior
-from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.settings import DiagnosisSettings
+from tpcd.discrepancy.workbench import Workbench
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings

@@ -12,15 +12,15 @@ from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import naming, rivals
+from tpcd.discrepancy import rivals, workbench
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import Fit, Question, fit_model
-from tpcd.discrepancy.naming import Round, Workbench
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings
+from tpcd.discrepancy.workbench import Round, Workbench
 from tpcd.effects import Effect, find_effect
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
@@ -95,8 +95,8 @@ class Stand:
         monkeypatch.setattr(rivals, "looked_closer", self.closer)
         monkeypatch.setattr(rivals, "pruned", lambda bench, fit: fit)
         monkeypatch.setattr(rivals, "glance", self.look)
-        monkeypatch.setattr(naming, "lower_bound", lambda *_: 1.0)
-        monkeypatch.setattr(naming, "held_out_scores", lambda *_: torch.zeros(5))
+        monkeypatch.setattr(workbench, "lower_bound", lambda *_: 1.0)
+        monkeypatch.setattr(workbench, "held_out_scores", lambda *_: torch.zeros(5))
         monkeypatch.setattr(Workbench, "adequacy", self.left)
 
     def fit(self, names: tuple[str, ...], value: float) -> Fit:
@@ -173,11 +173,25 @@ def test_what_was_found_is_fitted_again_before_it_gives_way(
 ) -> None:
     stand = Stand(monkeypatch)
     stand.evidence, stand.looks = {(FIELD.name,): 140.0}, {(FIELD.name,): 120.0}
-    stand.refitted = {(WALL.name,): 139.0}
+    stand.refitted = {(WALL.name,): 138.0}
     found = stand.ask((WALL.name,))
-    assert found.best is None and found.base.log_evidence == pytest.approx(139.0)
-    # The formula is no more likely, but it explains the data as well.
-    assert [one.names for one in found.close] == [(FIELD.name,)]
+    assert found.best is None and found.base.log_evidence == pytest.approx(138.0)
+    assert found.close == ()
+
+
+@pytest.mark.parametrize(
+    ("lead", "best", "close"),
+    [(2.9, WALL, None), (3.1, WALL, FIELD), (8.9, FIELD, WALL), (9.1, FIELD, None)],
+)
+def test_what_comes_close_is_told(
+    lead: float, best: Effect, close: Effect | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within 3 nats of the 6 that are asked."""
+    stand = Stand(monkeypatch)
+    stand.evidence, stand.looks = {(FIELD.name,): 100.0 + lead}, {(FIELD.name,): 100.0 + lead}
+    found = stand.ask((WALL.name,))
+    assert (found.best or found.base).names == (best.name,)
+    assert [one.names for one in found.close] == ([(close.name,)] if close else [])
 
 
 def test_a_formula_that_leaves_something_takes_the_place_of_nothing_that_does_not(

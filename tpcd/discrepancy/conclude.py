@@ -12,9 +12,9 @@ from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import Fit, fit_model, posterior
 from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors, typical_share
-from tpcd.discrepancy.naming import Workbench
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.variants import NUMERICS, Variant
+from tpcd.discrepancy.workbench import Workbench
 from tpcd.effects.formula import FORMULA_NAMES
 from tpcd.random import stream
 

@@ -14,17 +14,17 @@ from dataclasses import dataclass, replace
 
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import Fit, fit_model
-from tpcd.discrepancy.naming import (
+from tpcd.discrepancy.naming import pruned
+from tpcd.discrepancy.screening import Glance, glance
+from tpcd.discrepancy.settings import AMBIGUOUS, FRESH, RIVAL_SEEDS, WITHIN
+from tpcd.discrepancy.workbench import (
     Round,
     Workbench,
     alternative,
     each_of,
     looked_closer,
-    pruned,
     stands,
 )
-from tpcd.discrepancy.screening import Glance, glance
-from tpcd.discrepancy.settings import AMBIGUOUS, FRESH, RIVAL_SEEDS, WITHIN
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 
@@ -79,11 +79,11 @@ def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round
         if other is not rival:
             _note(bench, other, its, False, f"gain {its.log_evidence - current.log_evidence:.1f}")
     _note(bench, rival, fit, taken, reason)
-    lead = fit.log_evidence - current.log_evidence
+    beyond = fit.log_evidence - current.log_evidence - rival.price
     if not taken:
-        close = (alternative(fit, rival.without),) if lead > -AMBIGUOUS else ()
+        close = (alternative(fit, rival.without),) if beyond > -AMBIGUOUS else ()
         return Round(current, None, close)
-    close = (alternative(current, rival.without),) if lead < AMBIGUOUS else ()
+    close = (alternative(current, rival.without),) if beyond < AMBIGUOUS else ()
     return Round(current, pruned(bench, fit), close)
 
 

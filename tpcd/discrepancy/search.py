@@ -22,16 +22,7 @@ from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis
 from tpcd.discrepancy.evidence import TIED, Fit, Question
 from tpcd.discrepancy.memory import Memory
-from tpcd.discrepancy.naming import (
-    Round,
-    Workbench,
-    better_base,
-    find_confusions,
-    fit_well,
-    fitted_again,
-    name_one,
-    pruned,
-)
+from tpcd.discrepancy.naming import better_base, find_confusions, name_one, pruned
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import (
     FEWEST_DRAWS,
@@ -40,6 +31,7 @@ from tpcd.discrepancy.settings import (
     DiagnosisSettings,
 )
 from tpcd.discrepancy.variants import FINER, Variant, step_halving
+from tpcd.discrepancy.workbench import Round, Workbench, fit_well, fitted_again
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
@@ -159,7 +151,8 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
                 break
             close, current = found.close, pruned(bench, found.best)
         explained = _explains(bench, current)
-        if stage < 2 and current.names not in asked and len(current.effects) > bench.given:
+        found_some = len(current.effects) > bench.given
+        if found_some and pool is not FORMULAS and current.names not in asked:
             asked.add(current.names)
             rival = outdone(bench, base, current, explained)
             close = rival.close if rival.best else (*close, *rival.close)

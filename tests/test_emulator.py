@@ -142,17 +142,22 @@ def test_the_real_client_moves_it_and_zeroes_its_sensor(clients) -> None:
 
 
 def test_the_arm_is_at_a_target_one_delay_later(clients, emulator: EmulatorSettings) -> None:
+    """Never earlier, and not later either where the machine has time for it."""
     control, receive = clients
-    start = receive.getActualTCPPose()
-    goal = [*start[:2], start[2] + 1e-3, *start[3:]]
-    sent, stamp = receive.getTimestamp(), 0.0
-    assert control.servoL(goal, 0.0, 0.0, 0.002, 0.03, 500.0)
-    deadline = time.monotonic() + 2.0
-    while receive.getActualTCPPose()[2] < start[2] + 5e-4:
-        assert time.monotonic() < deadline
-        time.sleep(2e-4)
-    stamp = receive.getTimestamp()
-    assert emulator.servo_delay - 0.004 <= stamp - sent <= emulator.servo_delay + 0.05
+    delays = []
+    for _ in range(8):
+        start = receive.getActualTCPPose()
+        goal = [*start[:2], start[2] + 1e-3, *start[3:]]
+        sent = receive.getTimestamp()
+        assert control.servoL(goal, 0.0, 0.0, 0.002, 0.03, 500.0)
+        deadline = time.monotonic() + 2.0
+        while receive.getActualTCPPose()[2] < start[2] + 5e-4:
+            assert time.monotonic() < deadline
+            time.sleep(2e-4)
+        delays.append(receive.getTimestamp() - sent)
+        time.sleep(2 * emulator.servo_delay)  # until all of the way is done
+    assert min(delays) >= emulator.servo_delay - 0.004
+    assert min(delays) <= emulator.servo_delay + 0.05
     assert control.servoStop()
 
 

@@ -155,15 +155,16 @@ def test_a_formula_counts_for_two_effects(
         assert found.best.names == (*left, FIELD.name)
 
 
+@pytest.mark.parametrize("effects", [("force_bias",), ("force_bias", "payload")])
 @pytest.mark.parametrize("explained", [True, False])
 def test_where_something_is_left_every_formula_is_asked_in_place_of_all_effects(
-    explained: bool, monkeypatch: pytest.MonkeyPatch
+    explained: bool, effects: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No formula is of the site of the effect; the quick look sees none that is worth a fit."""
+    """No formula is of the sites of the effects; the quick look sees none that is worth a fit."""
     stand = Stand(monkeypatch)
     stand.evidence = {(WAVE.name,): 120.0, (STEP.name,): 110.0}
     stand.looks = dict.fromkeys(stand.evidence, 40.0)
-    found = stand.ask(("force_bias",), explained)
+    found = stand.ask(effects, explained)
     assert (found.best is not None) == (not explained)
     assert [c.name for c in stand.bench.candidates] == ([] if explained else [STEP.name, WAVE.name])
 
@@ -224,10 +225,10 @@ def test_effects_that_were_given_are_kept_and_asked_of_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stand = Stand(monkeypatch, given=1)
-    stand.evidence = {(FIELD.name, WAVE.name): 200.0, (FIELD.name, FIELD.name): 300.0}
-    stand.looks = {(FIELD.name, FIELD.name): 150.0, (FIELD.name, WAVE.name): 140.0}
-    found = stand.ask((FIELD.name, "floor_tilt"))
-    assert found.best is not None and found.best.names == (FIELD.name, WAVE.name)
+    stand.evidence = {(STEP.name, WAVE.name): 200.0, (STEP.name, STEP.name): 300.0}
+    stand.looks = {(STEP.name, STEP.name): 150.0, (STEP.name, WAVE.name): 140.0}
+    found = stand.ask((STEP.name, "floor_tilt"))
+    assert found.best is not None and found.best.names == (STEP.name, WAVE.name)
 
 
 def test_a_formula_that_fails_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

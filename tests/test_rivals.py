@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -229,6 +230,14 @@ def test_effects_that_were_given_are_kept_and_asked_of_no_more(
     stand.looks = {(STEP.name, STEP.name): 150.0, (STEP.name, WAVE.name): 140.0}
     found = stand.ask((STEP.name, "floor_tilt"))
     assert found.best is not None and found.best.names == (STEP.name, WAVE.name)
+
+
+def test_evidence_that_is_no_number_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand = Stand(monkeypatch)
+    stand.evidence = {(STEP.name,): math.nan, (WAVE.name,): 140.0}
+    stand.looks = {(STEP.name,): 150.0, (WAVE.name,): 140.0}
+    found = stand.ask(("floor_tilt",), explained=False)
+    assert found.best is not None and found.best.names == (WAVE.name,)
 
 
 def test_a_formula_that_fails_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

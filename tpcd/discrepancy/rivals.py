@@ -9,6 +9,7 @@ accepted for, and a formula, which is less likely beforehand, more (`Workbench.p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -65,6 +66,7 @@ def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round
         fits += each_of(
             bench, [rival.formula], _number(bench, rival), _fit_of(bench, current, rival)
         )
+    fits = [one for one in fits if math.isfinite(one[1].log_evidence)]
     best = max(fits, key=lambda one: one[1].log_evidence - one[0].price, default=None)
     if best is None:
         return Round(current)

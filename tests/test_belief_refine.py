@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,6 +82,25 @@ def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(
         assert torch.equal(last.state.tensors[name], value)
     whole = estimator.learn(episode, torch.Generator().manual_seed(0))
     assert torch.equal(whole.belief.vectors, closed.belief.vectors)
+
+
+def test_it_draws_again_while_too_few_draws_count(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep]
+) -> None:
+    def closed(passes: int, worth: float) -> EstimationStep:
+        sampler = replace(SETTINGS.sampler, closing_passes=passes, closing_worth=worth)
+        return refine(episode, estimator.shape, steps[-1].state, replace(SETTINGS, sampler=sampler))
+
+    never = math.inf
+    one, two, three = (closed(passes, never) for passes in (1, 2, 3))
+    assert 1.8 < two.info.evaluations / one.info.evaluations < 2.2
+    assert two.info.evaluations < three.info.evaluations
+    assert not torch.equal(one.belief.vectors, two.belief.vectors)
+    enough = closed(3, one.info.effective_sample_size)
+    assert enough.info == one.info and torch.equal(enough.belief.vectors, one.belief.vectors)
+    # As many passes as it takes, not one more.
+    reached = [k for k in (one, two, three) if k.info.effective_sample_size >= 25.0]
+    assert closed(3, 25.0).info == (reached[0] if reached else three).info
 
 
 def test_the_middle_of_an_episode_is_refined_from_its_own_data(

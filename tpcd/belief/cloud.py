@@ -65,6 +65,10 @@ class SamplerSettings:
     """Newton steps of the modes that are remembered, and of those that did not give up."""
     closing: int = 4
     """Times as many places, modes and draws once no more data are to come (see `refine`)."""
+    closing_passes: int = 3
+    """Times at most that those are drawn, each from where the one before arrived."""
+    closing_worth: float = 30.0
+    """Effective sample size with which they need not be drawn again."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
@@ -80,6 +84,8 @@ class SamplerSettings:
             "climbing_rounds": 0,
             "following_rounds": 0,
             "closing": 1,
+            "closing_passes": 1,
+            "closing_worth": 0,
         }
         for name, limit in least.items():
             if not getattr(self, name) >= limit:

@@ -3,11 +3,15 @@
 After each transition the sampler spends little, which is enough to choose the next move by. What
 is left of an episode is the belief after its last transition, and that one may cost more: with ten
 data the draws of `budget` are worth about ten, and their intervals are too narrow.
+
+One pass of more draws is enough for two episodes in three. In the others a few draws come
+upon a place that the mixture hardly reaches and outweigh the rest; a further pass begins there.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import torch
 
@@ -26,19 +30,25 @@ def refine(
     state: EstimatorState,
     settings: EstimatorSettings | None = None,
 ) -> EstimationStep:
-    """The belief that `state` holds, found once more with `settings.closing_budget`.
+    """The belief that `state` holds, found once more with `settings.closing_budget`, and again
+    while too few of the draws count.
 
     The particles and modes of the state are where its draws begin. The state stays as it is, and
-    the same state gives the same belief. Raises ValueError where no particle can explain the
-    episode.
+    the same state gives the same belief. What is told of the draws is of the last pass, their
+    cost of all. Raises ValueError where no particle can explain the episode.
     """
     settings = settings or EstimatorSettings()
     started = time.perf_counter()
     generator = torch.Generator()
     cloud = cloud_from_tensors(state.restore(generator))
     target = target_of(episode, shape, settings).given(history_of(episode).first(state.index))
-    cloud, info = assimilate(cloud, target, state.index, settings.closing_budget, generator)
-    belief = belief_of(cloud, target)
+    evaluations = 0
+    for _ in range(settings.sampler.closing_passes):
+        cloud, info = assimilate(cloud, target, state.index, settings.closing_budget, generator)
+        evaluations += info.evaluations
+        if info.effective_sample_size >= settings.sampler.closing_worth:
+            break
+    belief, info = belief_of(cloud, target), replace(info, evaluations=evaluations)
     return EstimationStep(state.index, belief, info, time.perf_counter() - started, state)
 
 

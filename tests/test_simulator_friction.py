@@ -17,7 +17,7 @@ from contact_scenes import (
 )
 from simulator_steps import CLOSE, ENGINES, SIDES, assert_near, step
 
-from tpcd.simulator import StepSettings, simulate_step
+from tpcd.simulator import ContactMode, StepSettings, simulate_step
 
 
 @ENGINES
@@ -32,6 +32,23 @@ def test_convex_friction_lifts_a_sliding_body_by_friction_times_slip(engine, sid
     assert_near(result.pose, slip * side, 0.02 + mu * slip, 0)
     real = step(scene, start, command, engine, friction="coulomb")
     assert abs(float(real.pose[1]) - 0.02) < CLOSE
+
+
+@ENGINES
+@SIDES
+@pytest.mark.parametrize("slip", [3e-8, 5e-7, 2e-6])
+def test_where_slip_has_just_begun_the_body_goes_with_the_arm(engine, side, slip):
+    mu, press = 0.4, 0.03
+    scene, start = make_scene(SLAB, friction=mu), vector(0, 0.02, 0)
+    command = vector((mu * press * STIFFNESS[1] / STIFFNESS[0] + slip) * side, 0.02 - press, 0)
+    result = step(scene, start, command, engine)
+    assert_near(result.pose, slip * side, 0.02, 0)
+    # Where it comes from no longer matters, and a floor that gives way changes the load alone.
+    torch.testing.assert_close(result.pose_from_start, torch.zeros(3, 3).double())
+    assert_near(result.pose_from_gap[0], mu * float(STIFFNESS[1] / STIFFNESS[0]) * side, -1, 0)
+    assert int(result.mode[0]) == (
+        ContactMode.SLIP_POSITIVE if side > 0 else ContactMode.SLIP_NEGATIVE
+    )
 
 
 @ENGINES

@@ -227,16 +227,17 @@ def _choose(world, o, law, pose, turn, space):
             + world.normals[o, t, 1] * pose[0] - world.normals[o, t, 0] * pose[1]
         )  # fmt: skip
         space.slipping[j] = abs(slip) > 10.0 * law.tolerance
-    # A point that is held by both its sides has not slipped.
     for j in range(3):
+        if space.chosen[j, 0] < 0:
+            continue
+        one_sided, held = True, False
         for i in range(3):
-            if (
-                j != i
-                and space.chosen[j, 0] >= 0
-                and space.chosen[j, 0] == space.chosen[i, 0]
-                and space.chosen[j, 1] == space.chosen[i, 1]
-            ):
-                space.slipping[j] = False
+            if i != j and space.chosen[i, 0] >= 0 and space.chosen[i, 1] == space.chosen[j, 1]:
+                held = held or space.chosen[i, 0] == space.chosen[j, 0]
+                one_sided = one_sided and space.side[i] == space.side[j]
+        # A point that is held by both its sides has not slipped; where all of a terrain's load
+        # is at one edge of the friction cone, slip begins, however little it still is.
+        space.slipping[j] = not held and (one_sided or space.slipping[j])
     largest = 0.0
     for t in range(world.normals.shape[1]):
         largest = max(largest, abs(space.load[t] - space.before[t]))

@@ -224,16 +224,22 @@ def _solve_rows(
 def _with_slip(
     scene: ContactScene, start: Tensor, pose: Tensor, contacts: ContactSet, tolerance: float
 ) -> ContactSet:
-    """Mark the loaded rows whose point has slipped; one held by both its sides has not."""
+    """Mark the loaded rows whose point slips.
+
+    One held by both its sides has not slipped. Where all of a terrain's load is at one edge of
+    the friction cone, slip begins, however little it still is.
+    """
     now, before = (loaded_frames(scene, at, contacts) for at in (pose, start))
     slip = ((now.points_world - before.points_world) * now.tangent).sum(-1)
     loaded = contacts.multiplier > 0
-    twin = (contacts.point[:, :, None] == contacts.point[:, None, :]) & (
-        contacts.terrain[:, :, None] == contacts.terrain[:, None, :]
+    beside = (contacts.terrain[:, :, None] == contacts.terrain[:, None, :]) & (
+        loaded[:, :, None] & loaded[:, None, :]
     )
-    twin = twin & loaded[:, :, None] & loaded[:, None, :]
-    held = twin.sum(-1) > 1
-    return replace(contacts, slipping=loaded & ~held & (slip.abs() > 10 * tolerance))
+    held = (beside & (contacts.point[:, :, None] == contacts.point[:, None, :])).sum(-1) > 1
+    other_side = contacts.side[:, :, None] != contacts.side[:, None, :]
+    one_sided = ~(beside & other_side).any(-1)
+    slips = one_sided | (slip.abs() > 10 * tolerance)
+    return replace(contacts, slipping=loaded & ~held & slips)
 
 
 def _motion(step: Tensor, extent: Tensor) -> Tensor:

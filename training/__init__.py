@@ -2,9 +2,9 @@
 
 `config` what can be set · `outlines` which outlines · `correspondence`, `layout`, `mixture`
 how they are arranged in the latent space and what lies between them · `polygons` exact
-distances · `data`, `module`, `rates`, `monitor` Lightning · `refine` the head's last stage ·
-`validity` where the prior may be drawn · `evaluate`, `fit`, `unseen` the figures of the card
-· `run` one training · `train`, `measure` the commands.
+distances · `data`, `module`, `rates`, `muon`, `monitor` Lightning · `refine` the head's last
+stage · `validity` where the prior may be drawn · `evaluate`, `fit`, `unseen` the figures of
+the card · `run` one training · `train`, `measure` the commands.
 
 How many latents the rich prior has was decided on outlines in correspondence (principal
 components of 186 views and mirror images), fitted to 23 views of twelve left-out objects

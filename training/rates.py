@@ -1,7 +1,7 @@
 """The optimisers and learning rates that all stages share.
 
-Muon (K. Jordan et al. 2024, in torch.optim) moves the hidden matrices, Adam everything
-else; both follow a linear warm-up and half a cosine.
+Muon (see `muon`) moves the hidden matrices, Adam everything else; both follow a linear
+warm-up and half a cosine.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import math
 
 import torch
 from torch import nn
+
+from training.muon import Muon
 
 WARM_UP = 50
 """Steps over which the learning rates rise."""
@@ -40,5 +42,5 @@ def split_optimizers(
         groups.append({"params": codes, "lr": code_rate})
     return [
         torch.optim.Adam(groups, betas=(0.9, 0.99)),
-        torch.optim.Muon(hidden, lr=muon_rate, momentum=0.95, weight_decay=0.0),
+        Muon(hidden, lr=muon_rate),
     ]

@@ -65,7 +65,7 @@ class SamplerSettings:
     """Newton steps of the modes that are remembered, and of those that did not give up."""
     closing: int = 4
     """Times as many places, modes and draws once no more data are to come (see `refine`)."""
-    closing_passes: int = 3
+    closing_passes: int = 2
     """Times at most that those are drawn, each from where the one before arrived."""
     closing_worth: float = 30.0
     """Effective sample size with which they need not be drawn again."""

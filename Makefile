@@ -21,7 +21,7 @@ demo: $(INSTALLED) ## set up, then learn an unknown object in simulation and tes
 
 test: $(INSTALLED) ## set up, then check style and run the tests (without slow, robot, device)
 	$(BIN)/ruff check .
-	$(PYTEST) -n $(WORKERS) --dist loadfile -m "not slow and not robot and not device"
+	$(PYTEST) -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow and not robot and not device"
 
 test-slow: $(INSTALLED) ## the tests that take longer
 	$(PYTEST) -m "slow and not robot and not device"

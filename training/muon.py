@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
-"""Of x, x^3 and x^5: five rounds bring singular values from 0.01 to 1 into 0.7 to 1.2."""
+"""Of x, x^3 and x^5: five rounds bring singular values from 0.01 to 1 into 0.68 to 1.14."""
 ROUNDS = 5
 LEAST_NORM = 1e-7
 

@@ -4,7 +4,7 @@ After each transition the sampler spends little, which is enough to choose the n
 is left of an episode is the belief after its last transition, and that one may cost more: with ten
 data the draws of `budget` are worth about ten, and their intervals are too narrow.
 
-One pass of more draws is enough for two episodes in three. In the others a few draws come
+One pass of more draws is enough for seven episodes in ten. In the others a few draws come
 upon a place that the mixture hardly reaches and outweigh the rest; a further pass begins there.
 """
 

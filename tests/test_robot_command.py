@@ -66,7 +66,7 @@ def test_a_fault_in_the_command_is_one_line_and_goes_on_with_resume(
     lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and "protective stop" in lines[0] and "--resume" in lines[0]
     before = read_episode(out / "explore.csv")
-    assert 2 <= len(before) < 6  # 4 on an idle machine as on a busy one; with 14 s it is 2
+    assert 2 <= len(before) < 6  # 4 on an idle machine; with 14 s it is 2
     sound = emulator_settings()
     with running_emulator(sound):
         assert robot_command("--robot", sound.address, *arguments, "--resume") == 0

@@ -56,6 +56,15 @@ class ContactScene:
             friction=self.friction.reshape(-1, self.friction.shape[-1])[index],
         )
 
+    def further(self, gap: Float[Tensor, "*batch t"]) -> ContactScene:
+        """The same with half-planes that are further away by `gap` [m]."""
+        planes = []
+        for body, more in zip(self.terrains, gap.unbind(-1), strict=True):
+            assert isinstance(body, HalfPlane)
+            offset = body.offset - more
+            planes.append(HalfPlane(body.direction.expand(*offset.shape, 2), offset))
+        return ContactScene(self.points_ee, tuple(planes), self.friction.expand(gap.shape))
+
     def columns(self, index: Int[Tensor, " n"]) -> ContactScene:
         """The scenes at positions `index` of the last batch axis, where it has more than one."""
 

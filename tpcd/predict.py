@@ -1,7 +1,7 @@
 """The learnt contact dynamics p(x', w' | x, u) as an object to hold, ask and plan with.
 
-Each particle of the belief predicts a normal distribution of the settled pose: the model's
-pose moved by the mean of its misfit field, with the field's remaining uncertainty and the
+Each particle of the belief predicts a normal distribution of the settled pose: where contact
+comes to rest with the mean of its misfit field, with the field's remaining uncertainty and the
 propagated noise of the start pose. The prediction is the mixture over particles. The wrench
 follows from the pose, w = K (x' - u), so one mixture serves both.
 """
@@ -79,12 +79,13 @@ class ContactPredictor:
         pose, command = pose.double(), command.double()
         previous = None if previous is None else previous.double()
         found = None
+        gap = self._gap(self._field_mean[:, None], command[:, 2])
         if self._added.effects:
             found = self._with_effects(pose, command, previous)
             transition = found.transition
         else:
             transition = simulate_step(
-                self._scene,
+                self._scene if gap is None else self._scene.further(gap),
                 pose,
                 command,
                 self.belief.stiffness,
@@ -102,7 +103,7 @@ class ContactPredictor:
         )
         covariance = covariance + uncovered
         if rows.shape[-1]:
-            settled = settled + (rows @ self._field_mean[:, None, :, None])[..., 0]
+            settled = settled + _shift(rows, self._field_mean[:, None], transition, gap)
             scaled = rows @ self._field_root[:, None]
             covariance = covariance + scaled @ scaled.mT
         usable = transition.status <= int(StepStatus.RELAXED)
@@ -149,8 +150,21 @@ class ContactPredictor:
             starts = pose.repeat_interleave(2, dim=0)
             rows = Rows(first, torch.ones(len(commands), dtype=torch.float64), starts)
         return simulate_rows(
-            self._flat, rows, commands, self.belief.stiffness, self._added, self.belief.step
+            self._flat,
+            rows,
+            commands,
+            self.belief.stiffness,
+            self._added,
+            self.belief.step,
+            gap=self._gap(self._field_mean[:, None], commands[:, 2]),
         )
+
+    def _gap(
+        self, coefficients: Float[Tensor, "*#batch c"], angle: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch t"] | None:
+        """What the field changes of the gaps where the arm is asked to turn the object to `angle`,
+        from which the rest of the way is linear."""
+        return self.belief.misfit.gap(coefficients, angle) if coefficients.shape[-1] else None
 
     def rollout(
         self,
@@ -175,20 +189,24 @@ class ContactPredictor:
         walk = None
         if self._added.effects:
             rest = pose if before is None else before
+            everything = torch.cat((rest[None], commands))
             walk = RowByRow(
                 self._flat.gather(chosen),
-                torch.cat((rest[None], commands)),
+                everything,
                 self.belief.stiffness,
                 self._added[chosen],
                 self.belief.step,
                 pose,
+                self._gap(field[:, None], everything[:, 2]),
             )
         here, steps = pose.expand(samples, 3), []
         stiffness = self.belief.stiffness
         for row, command in enumerate(commands, start=1):
+            gap = self._gap(field, command[2])
             if walk is None:
+                world = scene if gap is None else scene.further(gap)
                 transition = simulate_step(
-                    scene, here, command, stiffness, self.belief.step, previous=before
+                    world, here, command, stiffness, self.belief.step, previous=before
                 )
             else:
                 found = walk.settle(row, here)
@@ -197,7 +215,7 @@ class ContactPredictor:
             rows, uncovered = misfit_rows(
                 self.belief.misfit, self._field_sd[chosen], here[..., 2], transition
             )
-            shift = (rows @ field[..., None])[..., 0] if rows.shape[-1] else torch.zeros_like(here)
+            shift = _shift(rows, field, transition, gap)
             here = here + shift
             if walk is None:
                 offset = here - command
@@ -208,3 +226,16 @@ class ContactPredictor:
             steps.append(torch.cat((here, wrench), dim=-1))
             before = command
         return torch.stack(steps, dim=1)
+
+
+def _shift(
+    rows: Float[Tensor, "*#batch 3 c"],
+    coefficients: Float[Tensor, "*#batch c"],
+    transition: Transition,
+    gap: Float[Tensor, "*#batch t"] | None,
+) -> Float[Tensor, "*batch 3"]:
+    """What the field moves of poses that settled with `gap` of it already."""
+    if gap is None:
+        return torch.zeros_like(transition.pose)
+    moved = (rows @ coefficients[..., None])[..., 0]
+    return moved - (transition.pose_from_gap * gap[..., None]).sum(-2)

@@ -80,8 +80,13 @@ def filter_history(
             settled.append(nothing)
             continue
         begins, ends = (_turn(conditions.turn, row) for row in (k, k + 1))
+        here = _column(scene, k + 1)
+        # What the field changes is known in part, and contact there is not as without it.
+        if count:
+            gap = field.gap(state.mean[:, :count], setting.angles[k])
+            here = here.further(gap)
         transition = simulate_step(
-            _column(scene, k + 1),
+            here,
             merged.poses[:, k] - state.mean[:, count:] + begins,
             _row(conditions.target - conditions.carried, k + 1) + ends,
             _row(conditions.stiffness, k + 1),
@@ -90,6 +95,9 @@ def filter_history(
         )
         pose = transition.pose - ends + _row(conditions.give, k + 1)
         residual = angle_difference(merged.poses[:, k + 1], pose)
+        if count:
+            # As from no field at all, along the derivatives where it was stepped.
+            residual = residual + (transition.pose_from_gap * gap[..., None]).sum(-2)
         rows, uncovered = misfit_rows(field, sd, setting.angles[k], transition)
         usable = (transition.status <= int(StepStatus.RELAXED)) & finite
         usable = usable & torch.isfinite(residual).all(-1)

@@ -2,9 +2,10 @@
 
 The unknowns that theta leaves are linear and normal: the coefficients c of the misfit field,
 and the error e_k of each estimated pose, poses[k] = true pose + e_k with e_k ~ N(0, R_k). A
-transition starts at the filtered pose s = poses[k - 1] - E[e_{k-1}] and leaves the residual
+transition starts at the filtered pose s = poses[k - 1] - E[e_{k-1}], with terrains as far away
+as the filtered field g = E[c] says, and leaves the residual
 
-    r_k = poses[k] - f(s, u_k) = e_k - F_k (e_{k-1} - E[e_{k-1}]) + H_k c + v_k,
+    r_k = poses[k] - f(s, g, u_k) + H_k g = e_k - F_k (e_{k-1} - E[e_{k-1}]) + H_k c + v_k,
 
 with F = d pose / d start, H from `misfit_rows` and v_k ~ N(0, V_k) what the bumps do not
 cover. So one reading's error is in two residuals, and the state (c, e_{k-1}) is carried from

@@ -16,7 +16,14 @@ import numpy as np
 from numba import njit
 
 from tpcd.belief import kernel_filter
-from tpcd.belief.kernel_filter import assimilate, begin, follow, new_filter, pass_over
+from tpcd.belief.kernel_filter import (
+    assimilate,
+    begin,
+    expect_gap,
+    follow,
+    new_filter,
+    pass_over,
+)
 from tpcd.simulator.kernel import source_stamp
 from tpcd.simulator.kernel_element import step_element
 from tpcd.simulator.kernel_geometry import World, new_chains
@@ -124,7 +131,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         np.zeros((steps, terrains, 3)),
         np.zeros((steps, terrains, 4)),
     )
-    state = new_filter(size, entries)
+    state = new_filter(size, entries, terrains)
     # Each particle starts its transitions at poses of its own.
     starts, previous, commands = (
         np.zeros((steps, 3)), np.zeros((steps, 3)), np.zeros((steps, 3))
@@ -172,6 +179,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                 pass_over(state, measured, seen, k, size)
                 continue
             _meet(here, given, i, k + 1)
+            expect_gap(state, measured, k, here.offsets[0])
             set_stiffness(law, given.stiffness[firm, k + 1 if given.stiffness.shape[1] > 1 else 0])
             begins, ends = _turns(given, turned, k)
             for a in range(3):

@@ -23,7 +23,8 @@ class Filter(NamedTuple):
 
     `mean` (s), `covariance` (s, s); `design` (3, s) of the residual, `cross` (3, s) first its
     covariance with the state, then the gain; `factor` (3, 3) of the residual's covariance;
-    `innovation` (3) whitened; `by_theta` (d, s) derivatives of the mean.
+    `innovation` (3) whitened; `by_theta` (d, s) derivatives of the mean. `gap` (t) is what the
+    field changes at the transition, as far as it is known.
     """
 
     mean: np.ndarray
@@ -33,12 +34,14 @@ class Filter(NamedTuple):
     factor: np.ndarray
     innovation: np.ndarray
     by_theta: np.ndarray
+    gap: np.ndarray
 
 
 @njit
 @no_type_check
-def new_filter(size, entries):
-    """Room for a filter of so many coefficients, with derivatives by so many entries of theta."""
+def new_filter(size, entries, terrains):
+    """Room for a filter of so many coefficients over some terrains, with derivatives by so many
+    entries of theta."""
     return Filter(
         np.zeros(size + 3),
         np.zeros((size + 3, size + 3)),
@@ -47,6 +50,7 @@ def new_filter(size, entries):
         np.zeros((3, 3)),
         np.zeros(3),
         np.zeros((entries, size + 3)),
+        np.zeros(terrains),
     )
 
 
@@ -78,6 +82,18 @@ def pass_over(state, measured, seen, k, size):
             state.by_theta[e, size + a] = 0.0
 
 
+@njit(_nrt=False)
+@no_type_check
+def expect_gap(state, measured, k, offsets):
+    """Move planes away by what the field is known to change of their gaps at transition k."""
+    bumps = measured.bumps.shape[1]
+    for t in range(state.gap.shape[0]):
+        state.gap[t] = 0.0
+        for j in range(bumps):
+            state.gap[t] += measured.bumps[k, j] * state.mean[t * bumps + j]
+        offsets[t] -= state.gap[t]
+
+
 @njit(error_model="numpy", _nrt=False, forceinline=True)
 @no_type_check
 def assimilate(state, measured, answer, seen, k, sd):
@@ -91,6 +107,10 @@ def assimilate(state, measured, answer, seen, k, sd):
     if answer.statuses[k] > RELAXED or not math.isfinite(total):
         return -np.inf
     innovation[2] = math.pi - (math.pi - innovation[2]) % (2.0 * math.pi)
+    # The step was made with the field's gaps; its design tells what it would be without them.
+    for t in range(answer.from_gap.shape[1]):
+        for a in range(3):
+            innovation[a] += answer.from_gap[k, t, a] * state.gap[t]
     _fill_design(design, measured, answer, k, size)
     for a in range(3):
         for b in range(a + 1):

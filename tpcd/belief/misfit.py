@@ -3,10 +3,11 @@
 No outline of the prior is the true one. Seen from a flat terrain, an outline error is a
 change of the gap that depends on the angle of the object: eps_t(angle), one smooth function
 for each terrain, with variance sd^2 and correlation exp(-(a - b)^2 / (4 width^2)). Its
-slope moves the contact point along the terrain, which changes the lever of the force. Both
-act linearly on the settled pose, so for given theta the field is a linear-Gaussian model:
-it is integrated out of the likelihood in closed form, learnt from the same data, and its
-posterior corrects and widens predictions (Rao-Blackwellisation).
+slope moves the contact point along the terrain, which changes the lever of the force. What
+of both is not known acts linearly on the settled pose, so for given theta the field is a
+linear-Gaussian model: it is integrated out of the likelihood in closed form, learnt from the
+same data, and its posterior corrects and widens predictions (Rao-Blackwellisation). What is
+known moves the terrains themselves: contact begins where the field says.
 
 eps_t(angle) = sum_j b_j(angle) c_tj, with c ~ N(0, sd^2) and Gaussian bumps b_j.
 
@@ -58,6 +59,13 @@ class MisfitField:
     def sd_of(self, score: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Standard deviation of the outline error [m] from a standard normal score."""
         return self.sd * torch.exp(self.spread * score)
+
+    def gap(
+        self, coefficients: Float[Tensor, "*#batch c"], angle: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch t"]:
+        """The field's change of the gap to each of t terrains [m], for c = t x j coefficients."""
+        each = coefficients.unflatten(-1, (-1, self.bumps))
+        return (each * self.basis(angle)[0][..., None, :]).sum(-1)
 
     def basis(
         self, angle: Float[Tensor, "*batch"]

@@ -36,10 +36,12 @@ def simulate_rows(
     added: Added,
     settings: StepSettings,
     passes: int | None = None,
+    gap: Float[Tensor, "m r t"] | None = None,
 ) -> SimulatedRows:
     """Settle every row from the start pose it has in `rows`; scenes and effects of m particles.
 
-    `passes` replaces the number that the effects ask for. Rows that follow no other have no
+    `passes` replaces the number that the effects ask for. Terrains are further away by the
+    `gap` [m]. Rows that follow no other have no
     answer, but what they are loaded with where the arm rests off its command.
     """
     base = base_conditions(scene, commands, stiffness)
@@ -50,10 +52,10 @@ def simulate_rows(
     outcome = None
     for k in range(added.passes if passes is None else passes):
         conditions = added.apply(base, rows, outcome)
-        transition = _settle(scene, conditions, rows, loaded, settings)
+        transition = _settle(scene, conditions, rows, loaded, settings, gap)
         outcome = _outcome(transition, rows, loaded, first=k == 0)
     conditions = added.apply(base, rows, outcome)
-    return _read(_settle(scene, conditions, rows, index, settings), conditions, index)
+    return _read(_settle(scene, conditions, rows, index, settings, gap), conditions, index)
 
 
 class RowByRow:
@@ -70,8 +72,11 @@ class RowByRow:
         added: Added,
         settings: StepSettings,
         start: Float[Tensor, " 3"],
+        gap: Float[Tensor, "m r t"] | None = None,
     ) -> None:
-        """All commands of the run; row 0 is the start pose [m, m, rad]."""
+        """All commands of the run; row 0 is the start pose [m, m, rad]. Terrains are further away
+        by the `gap` [m]."""
+        self._gap = gap
         self._scene, self._added, self._settings = scene, added, settings
         self._base = base_conditions(scene, commands, stiffness)
         self._rows = sequence(start.expand(len(commands), 3))
@@ -93,7 +98,7 @@ class RowByRow:
         rows = replace(self._rows, starts=starts)
         conditions = self._first
         for left in range(self._added.passes, -1, -1):
-            transition = _settle(self._scene, conditions, rows, index, self._settings)
+            transition = _settle(self._scene, conditions, rows, index, self._settings, self._gap)
             now = _outcome(transition, rows, index, first=left == self._added.passes)
             parts = zip(vars(now).items(), vars(self._past).values(), strict=True)
             seen = Outcome(
@@ -125,11 +130,18 @@ def _read(transition: Transition, conditions: Conditions, index: Tensor) -> Simu
 
 
 def _settle(
-    scene: ContactScene, conditions: Conditions, rows: Rows, index: Tensor, settings: StepSettings
+    scene: ContactScene,
+    conditions: Conditions,
+    rows: Rows,
+    index: Tensor,
+    settings: StepSettings,
+    gap: Tensor | None,
 ) -> Transition:
     here = conditions.scene(scene.points_ee[:, None])
     if here.batch_shape[1] > 1:
         here = here.columns(index)
+    if gap is not None:
+        here = here.further(gap[:, index])
     before = rows.follows[index]
     target, turn = conditions.target, _pose(conditions.turn)
     starts, commands, previous = torch.broadcast_tensors(

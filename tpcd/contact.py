@@ -132,10 +132,10 @@ def column_scene(scene: ContactScene) -> ContactScene:
 
 
 def terrain_gaps(
-    points_ee: Float[Tensor, "*batch p 2"],
+    points_ee: Float[Tensor, "*#batch p 2"],
     terrains: tuple[Terrain, ...],
-    pose: Float[Tensor, "*batch 3"],
-) -> tuple[Float[Tensor, "*batch t p"], Float[Tensor, "*batch t p"]]:
+    pose: Float[Tensor, "*#batch 3"],
+) -> tuple[Float[Tensor, "*batch2 t p"], Float[Tensor, "*batch2 t p"]]:
     """Gap of every outline point to every terrain [m], and its derivative by the angle [m/rad]."""
     points_world = transform_points(pose, points_ee)
     turned = perpendicular(points_world - pose[..., None, :2])

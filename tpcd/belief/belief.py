@@ -24,6 +24,7 @@ from tpcd.belief.cloud import (
     cloud_to_tensors,
     start_cloud,
 )
+from tpcd.belief.free_start import log_free
 from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
 from tpcd.belief.misfit import MisfitField
@@ -31,7 +32,7 @@ from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.resampling import weighted_quantile
 from tpcd.belief.state import EstimatorState
 from tpcd.belief.target import ContactTarget
-from tpcd.contact import scene_from_parameters, terrain_gaps
+from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.effects.protocol import Effect
 from tpcd.parameters import Parameters
@@ -175,9 +176,10 @@ def prior_belief(
     generator: torch.Generator,
     settings: EstimatorSettings | None = None,
 ) -> Belief:
-    """The belief before any transition: draws from the prior that leave the start pose free.
+    """The belief before any transition: draws from the prior, weighted by how likely they leave the
+    start pose free.
 
-    Where none does, all of them.
+    Where none does, all of them alike.
     """
     settings = settings or EstimatorSettings()
     target = target_of(episode, shape, settings)
@@ -185,9 +187,9 @@ def prior_belief(
     score = target.sample(settings.sampler.particles, generator)
     vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
     scene = scene_from_parameters(shape, prior.parameters_of(vectors)).double()
-    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, episode.poses[0].expand(len(sd), 3))
-    free = (gaps.amin((-1, -2)) > -2 * sd).double()
-    weights = free if bool(free.any()) else torch.ones_like(free)
+    setting = history_of(episode).setting(scene)
+    free = log_free(scene.points_ee, setting, sd, torch.tensor([0])).exp()
+    weights = free if float(free.max()) > 0.5 else torch.ones_like(free)
     size = misfit.bumps * len(scene.terrains)
     return Belief(
         prior=prior,

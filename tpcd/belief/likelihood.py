@@ -9,6 +9,9 @@ reach. No term can exceed the density of its reading's own noise at zero, log N(
 that a proposal may be given up once even that would not lift it over its threshold (`least`).
 This changes no decision; it spares most of the cost of bad proposals.
 
+Where a recording begins in free space, no particle may have the object inside of floor or
+wall there, which no transition would tell (`free_start`).
+
 Effects change the conditions of the steps. Those that answer to an outcome (a floor that
 yields under load) are solved in passes: each takes the outcome under the conditions before.
 Their likelihood also holds what the readings of pose and wrench say about each other, relative
@@ -25,6 +28,7 @@ from torch import Tensor
 
 from tpcd.belief.compiled import compiled_filter
 from tpcd.belief.filtered import HistoryLikelihood, Steps, filter_history
+from tpcd.belief.free_start import free_starts, log_free
 from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import Setting, merge
@@ -74,18 +78,23 @@ def history_likelihood(
     points = native.outlines(shape, parameters) if compiled else None
     scene = scene_from_parameters(shape, parameters, points)
     setting = history.setting(scene)
-    relative = None
+    further = torch.zeros_like(misfit_sd)
     if added is not None and added.effects:
         setting, _ = effective_setting(scene, history, misfit_sd, field, settings, added, outcome)
         read = history.read
-        relative = setting.merged.log_parity(read) - history.merged.log_parity(read)
-        least = None if least is None else least - relative
+        further = setting.merged.log_parity(read) - history.merged.log_parity(read)
+    begins = free_starts(history)
+    if len(begins):
+        further = further + log_free(scene.points_ee, setting, misfit_sd, begins)
+    # What is impossible already need not be stepped.
+    least = None if least is None else torch.where(further > -torch.inf, least - further, torch.inf)
     arguments = (scene.points_ee, setting, misfit_sd, field, settings)
     if compiled:
         found = compiled_filter(*arguments, least, innovations)
     else:
         found = filter_history(*arguments, innovations)
-    return found if relative is None else replace(found, total=found.total + relative)
+    total = torch.where(further > -torch.inf, found.total + further, -torch.inf)
+    return replace(found, total=total)
 
 
 def effective_setting(

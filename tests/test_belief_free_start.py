@@ -1,0 +1,134 @@
+"""A recording that begins in free space says where floor and wall are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tpcd.belief.belief import EstimatorSettings, prior_belief
+from tpcd.belief.free_start import free_starts, log_free
+from tpcd.belief.history import History, history_of, joined_history
+from tpcd.belief.likelihood import history_likelihood
+from tpcd.belief.misfit import MisfitField
+from tpcd.contact import scene_from_parameters
+from tpcd.data.episode import Episode
+from tpcd.effects.catalogue import find_effect
+from tpcd.effects.protocol import Added
+from tpcd.parameters import Parameters
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings
+
+STIFFNESS = torch.tensor([1000.0, 1000.0, 30.0], dtype=torch.float64)
+NOISE = torch.tensor([2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02], dtype=torch.float64)
+SD = 5e-4
+FIELD = MisfitField(sd=SD)
+
+
+@pytest.fixture(scope="module")
+def shape() -> PolygonShape:
+    return PolygonShape(builtin_outlines()["milk_carton"])
+
+
+def theta(floor: Tensor, wall: float = 0.18, angle: float = 0.0) -> Tensor:
+    """Particles that differ in the height of the floor [m]."""
+    rest = torch.tensor([1.0, 0.0, 0.0, angle, 0.5, 0.0, wall], dtype=torch.float64)
+    vectors = rest.expand(len(floor), 7).clone()
+    vectors[:, 5] = floor
+    return vectors
+
+
+def lowest(shape: PolygonShape) -> float:
+    return float(shape.outline.vertices[:, 1].min())
+
+
+def hovering(shape: PolygonShape, height: float, loaded: float = 0.0) -> Episode:
+    """Two rows `height` above world z = 0, the first `loaded` by so many newtons from below."""
+    z = height - lowest(shape)
+    commands = torch.tensor([[0.0, z, 0.0], [0.0, z + 0.01, 0.0]], dtype=torch.float64)
+    poses = commands.clone()
+    poses[0, 1] += loaded / 1000.0
+    return Episode(commands, poses, STIFFNESS * (poses - commands), STIFFNESS, NOISE)
+
+
+def total(shape: PolygonShape, vectors: Tensor, history: History, **further) -> Tensor:
+    sd = torch.full((len(vectors),), SD, dtype=torch.float64)
+    parameters = Parameters.from_vector(vectors)
+    return history_likelihood(
+        shape, parameters, sd, history, FIELD, StepSettings(), **further
+    ).total
+
+
+def test_the_probability_is_that_of_a_normal_gap(shape: PolygonShape) -> None:
+    floor = torch.tensor([-0.02, -1e-3, 0.0, 5e-4, 2e-3], dtype=torch.float64)
+    history = history_of(hovering(shape, 0.0))
+    sd = torch.full((5,), SD, dtype=torch.float64)
+    scene = scene_from_parameters(shape, Parameters.from_vector(theta(floor)))
+    found = log_free(scene.points_ee, history.setting(scene), sd, torch.tensor([0]))
+    foot = scene.points_ee[0, scene.points_ee[0, :, 1].argmin(), 0].abs()
+    variance = SD**2 + history.variance[0, 1] + foot**2 * history.variance[0, 2]
+    expected = torch.special.log_ndtr(-floor / variance.sqrt())
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_what_would_overlap_at_the_start_is_all_but_impossible(shape: PolygonShape) -> None:
+    """On its way up the object tells nothing of the floor, but that it is not where it began."""
+    floor = torch.tensor([-5e-3, 5e-3], dtype=torch.float64)
+    below, inside = total(shape, theta(floor), history_of(hovering(shape, 0.0)))
+    assert below - inside > 10.0
+    walls = torch.cat((theta(floor[:1], wall=0.2), theta(floor[:1], wall=0.02)))
+    clear, through = total(shape, walls, history_of(hovering(shape, 0.0)))
+    assert clear - through > 100.0
+
+
+def test_a_start_under_load_says_nothing_of_this_kind(shape: PolygonShape) -> None:
+    assert free_starts(history_of(hovering(shape, 0.0))).tolist() == [0]
+    assert free_starts(history_of(hovering(shape, 0.0, loaded=3.0))).tolist() == []
+
+
+def test_each_recording_begins_anew_and_only_what_counts_is_asked(shape: PolygonShape) -> None:
+    both = joined_history([hovering(shape, 0.0), hovering(shape, 0.01)])
+    assert free_starts(both).tolist() == [0, 2]
+    assert free_starts(both.using(torch.tensor([False, False, True]))).tolist() == [2]
+    floor = torch.tensor([-5e-3, 5e-3], dtype=torch.float64)
+    values = total(shape, theta(floor), both.using(torch.tensor([False, False, True])))
+    torch.testing.assert_close(values[0], values[1])
+
+
+def test_a_threshold_and_a_nan_concern_one_particle_alone(shape: PolygonShape) -> None:
+    history = history_of(hovering(shape, 0.0))
+    floor = torch.tensor([-5e-3, 5e-3, torch.nan], dtype=torch.float64)
+    plain = total(shape, theta(floor), history)
+    assert torch.isfinite(plain[:2]).all() and plain[2] == -torch.inf
+    least = plain.nan_to_num(0.0) + torch.tensor([-1.0, -1.0, 0.0])
+    torch.testing.assert_close(total(shape, theta(floor), history, least=least), plain)
+    above = total(shape, theta(floor), history, least=least + 50.0)
+    assert (above == -torch.inf).all()
+
+
+def test_effects_move_the_floor_there_as_elsewhere(shape: PolygonShape) -> None:
+    """A floor that drifts from -5 mm on is free at first, one that is tilted may not be."""
+    history = history_of(hovering(shape, 0.0))
+    floor = torch.full((2,), -1e-4, dtype=torch.float64)
+    tilt = Added((find_effect("floor_tilt"),), torch.tensor([[0.0], [0.2]], dtype=torch.float64))
+    flat, tilted = total(shape, theta(floor), history, added=tilt)
+    assert flat - tilted > 10.0
+
+
+def test_before_any_transition_draws_are_weighted_by_it(shape: PolygonShape) -> None:
+    episode = hovering(shape, 0.0)
+    start = Episode(episode.commands[:1], episode.poses[:1], episode.wrenches[:1], STIFFNESS, NOISE)
+    belief = prior_belief(
+        start, shape, torch.Generator().manual_seed(0), EstimatorSettings(misfit_sd=SD)
+    )
+    scene = scene_from_parameters(shape, belief.parameters)
+    gap = (scene.points_ee[..., 1] + episode.poses[0, 1]).amin(-1) - belief.parameters.floor_height
+    deep, clear = belief.weights[gap < -8e-3], belief.weights[gap > 8e-3]
+    assert len(deep) > 20 and float(deep.sum()) < 1e-3
+    assert float(clear.max() - clear.median()) < 1e-4
+    nowhere = replace(start, poses=start.poses - torch.tensor([0.0, 0.2, 0.0]))
+    lost = prior_belief(nowhere, shape, torch.Generator().manual_seed(0))
+    assert float(lost.weights.max() - lost.weights.min()) == 0.0

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 COMMAND = "python -m eval.calibration"
 RUNS_FILE = "runs.jsonl"
 BINS = 10
-ANGLE_ROUNDS = 20
+ANGLE_ROUNDS = 30
 """Rounds, each of half a step, in which the angle at which the misfit is read settles."""
 LEFTMOST_START = 0.12
 HIGHEST_START = 0.20
@@ -130,7 +130,7 @@ def draw_episode(
     import torch
 
     from tpcd.belief.belief import misfit_field
-    from tpcd.contact import scene_from_parameters
+    from tpcd.contact import scene_from_parameters, terrain_gaps
     from tpcd.data.episode import Episode
     from tpcd.simulator import simulate_step
     from tpcd.truth.motions import History, rich_exploration
@@ -141,26 +141,25 @@ def draw_episode(
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     # A start pose drawn without regard to theta says something about theta all the same: the
-    # object is free there. The likelihood knows that, so pairs of both are drawn until it is.
+    # object is free there. The likelihood knows that, so all of it is drawn until it is.
     start = torch.zeros(3, dtype=torch.float64)
+    field = misfit_field(prior.shape, settings)
     low, high = (edge[prior.names.index("floor_height")] for edge in (prior.low, prior.high))
     while True:
         score = prior.sample(1, generator)
-        parameters = prior.to_parameters(score[0])
-        scene = scene_from_parameters(prior.shape, parameters)
+        scene = scene_from_parameters(prior.shape, prior.to_parameters(score[0]))
+        terrains = len(scene.terrains)
+        misfit_sd = field.sd_of(normal(1))[0]
+        coefficients = misfit_sd * normal(field.bumps * terrains)
         draw = torch.rand(2, generator=generator, dtype=torch.float64)
         start[0] = -LEFTMOST_START * draw[0]
         start[1] = low + draw[1] * (high - low + HIGHEST_START)
-        points = scene.points_ee + start[:2]
-        floor_gap, wall_gap = (body.signed_distance(points).min() for body in scene.terrains)
+        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
+        floor_gap, wall_gap = gaps.amin(-1) + field.gap(coefficients, start[2])
         if 0 < floor_gap < LARGEST_GAP and wall_gap > 0:
             break
     vector = prior.to_vector(score)[0]
-    field = misfit_field(prior.shape, settings)
-    misfit_sd = field.sd_of(normal(1))[0]
     stiffness = torch.tensor(DEFAULT_STIFFNESS, dtype=torch.float64)
-    terrains = len(scene.terrains)
-    coefficients = misfit_sd * normal(field.bumps * terrains)
     sensor_std = torch.tensor(DEFAULT_SENSOR_STD, dtype=torch.float64)
     # `history_of` adds what any simulator's numerics leave to the noise of the poses.
     pose_std = (sensor_std[:3] ** 2 + 2e-5**2).sqrt()
@@ -179,7 +178,7 @@ def draw_episode(
         # The likelihood reads the field at the estimated angle, which the field itself moves.
         error = noise + weight * (wrench_noise - noise)
         uncovered = misfit_sd * normal(terrains)
-        angle = command[2]
+        angle = settled[2]
         for _ in range(ANGLE_ROUNDS):
             value, slope = field.basis(angle)
             gap = field.gap(coefficients, angle)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.belief import EstimatorSettings, prior_belief
-from tpcd.belief.free_start import free_starts, log_free
+from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History, history_of, joined_history
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
@@ -67,11 +67,66 @@ def test_the_probability_is_that_of_a_normal_gap(shape: PolygonShape) -> None:
     history = history_of(hovering(shape, 0.0))
     sd = torch.full((5,), SD, dtype=torch.float64)
     scene = scene_from_parameters(shape, Parameters.from_vector(theta(floor)))
-    found = log_free(scene.points_ee, history.setting(scene), sd, torch.tensor([0]))
+    rows = torch.tensor([0])
+    starts = start_gaps(scene.points_ee, history.setting(scene), history.poses[:, 2], rows)
     foot = scene.points_ee[0, scene.points_ee[0, :, 1].argmin(), 0].abs()
-    variance = SD**2 + history.variance[0, 1] + foot**2 * history.variance[0, 2]
-    expected = torch.special.log_ndtr(-floor / variance.sqrt())
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)
+    noise = history.variance[0, 1] + foot**2 * history.variance[0, 2]
+    expected = torch.special.log_ndtr(-floor / (noise + SD**2).sqrt())
+    torch.testing.assert_close(starts.log_free_before(FIELD, sd), expected, rtol=1e-3, atol=1e-9)
+    # Known to be 1 mm closer for sure, and 1 mm further away.
+    bump = FIELD.basis(torch.zeros((), dtype=torch.float64))[0]
+    mean = torch.cat((-1e-3 * bump / bump.square().sum(), torch.zeros_like(bump))).expand(5, -1)
+    nothing = torch.zeros(5, mean.shape[1], mean.shape[1], dtype=torch.float64)
+    left = SD**2 * (1 - bump.square().sum()).clamp_min(0.0)
+    for sign in (1.0, -1.0):
+        found = starts.log_free(FIELD, sd, sign * mean, nothing)
+        expected = torch.special.log_ndtr((-floor - sign * 1e-3) / (noise + left).sqrt())
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_angles_of_pose_and_hand_turn_the_outline(shape: PolygonShape) -> None:
+    """Turned by a quarter in the hand, the carton is as far from the floor as it is wide."""
+    history = history_of(hovering(shape, 0.1))
+    floor = torch.zeros(1, dtype=torch.float64)
+    scene = scene_from_parameters(shape, Parameters.from_vector(theta(floor)))
+    setting = history.setting(scene)
+    quarter = torch.full((1, 1, 1), torch.pi / 2, dtype=torch.float64)
+    turned = replace(setting, conditions=replace(setting.conditions, turn=quarter))
+    rows = torch.tensor([0])
+    found = start_gaps(scene.points_ee, turned, history.poses[:, 2], rows).gap[0, 0, 0]
+    side = -float(scene.points_ee[0, :, 0].min())
+    assert float(found) == pytest.approx(0.1 - lowest(shape) - side, abs=1e-9)
+    # The pose itself, by as much the other way.
+    poses = setting.merged.poses.clone()
+    poses[:, 0, 2] = -torch.pi / 2
+    back = replace(turned, merged=replace(setting.merged, poses=poses))
+    found = start_gaps(scene.points_ee, back, history.poses[:, 2], rows).gap[0, 0, 0]
+    assert float(found) == pytest.approx(0.1, abs=1e-9)
+
+
+def test_a_start_just_above_the_floor_does_not_push_the_floor_down(shape: PolygonShape) -> None:
+    """What the misfit at the floor is found to be is its gap at the start as well: the mean of the
+    floor stays where contact says."""
+    z = -lowest(shape)
+    heights = (z + 3e-4, z - 4e-3)
+    commands = torch.tensor([[0.0, h, 0.0] for h in heights], dtype=torch.float64)
+    poses = commands.clone()
+    poses[1, 1] = z
+    touch = Episode(commands, poses, STIFFNESS * (poses - commands), STIFFNESS, NOISE)
+    floor = torch.linspace(-5e-3, 5e-3, 401, dtype=torch.float64)
+    weights = total(shape, theta(floor), history_of(touch)).softmax(0)
+    # Taken for another misfit than that of the touch, the start would push it down by 0.5.
+    assert abs(float(weights @ floor)) < 0.25 * SD
+
+
+def test_more_recordings_of_one_start_say_no_more_than_one(shape: PolygonShape) -> None:
+    floor = torch.tensor([5e-4], dtype=torch.float64)
+    alone = total(shape, theta(floor), history_of(hovering(shape, 0.0)))
+    far = total(shape, theta(floor - 0.05), history_of(hovering(shape, 0.0)))
+    three = joined_history([hovering(shape, 0.0)] * 3)
+    again = total(shape, theta(floor), three) - total(shape, theta(floor - 0.05), three)
+    torch.testing.assert_close(again, alone - far)
+    assert float(alone - far) < -1.0
 
 
 def test_what_would_overlap_at_the_start_is_all_but_impossible(shape: PolygonShape) -> None:
@@ -129,6 +184,7 @@ def test_before_any_transition_draws_are_weighted_by_it(shape: PolygonShape) -> 
     deep, clear = belief.weights[gap < -8e-3], belief.weights[gap > 8e-3]
     assert len(deep) > 20 and float(deep.sum()) < 1e-3
     assert float(clear.max() - clear.median()) < 1e-4
-    nowhere = replace(start, poses=start.poses - torch.tensor([0.0, 0.2, 0.0]))
+    below = torch.tensor([0.0, 0.2, 0.0])
+    nowhere = replace(start, poses=start.poses - below, commands=start.commands - below)
     lost = prior_belief(nowhere, shape, torch.Generator().manual_seed(0))
     assert float(lost.weights.max() - lost.weights.min()) == 0.0

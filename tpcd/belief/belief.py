@@ -24,7 +24,7 @@ from tpcd.belief.cloud import (
     cloud_to_tensors,
     start_cloud,
 )
-from tpcd.belief.free_start import log_free
+from tpcd.belief.free_start import start_gaps
 from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
 from tpcd.belief.misfit import MisfitField
@@ -38,6 +38,9 @@ from tpcd.effects.protocol import Effect
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
+
+_SOME_FREE = 1e-3
+"""Where no draw is free at the start with this probability, they are not weighted by it."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +182,7 @@ def prior_belief(
     """The belief before any transition: draws from the prior, weighted by how likely they leave the
     start pose free.
 
-    Where none does, all of them alike.
+    Where none does (an object that leans on something at once), all of them alike.
     """
     settings = settings or EstimatorSettings()
     target = target_of(episode, shape, settings)
@@ -187,9 +190,12 @@ def prior_belief(
     score = target.sample(settings.sampler.particles, generator)
     vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
     scene = scene_from_parameters(shape, prior.parameters_of(vectors)).double()
-    setting = history_of(episode).setting(scene)
-    free = log_free(scene.points_ee, setting, sd, torch.tensor([0])).exp()
-    weights = free if float(free.max()) > 0.5 else torch.ones_like(free)
+    history = history_of(episode)
+    starts = start_gaps(
+        scene.points_ee, history.setting(scene), history.poses[:, 2], torch.tensor([0])
+    )
+    free = starts.log_free_before(misfit, sd).exp()
+    weights = free if float(free.max()) > _SOME_FREE else torch.ones_like(free)
     size = misfit.bumps * len(scene.terrains)
     return Belief(
         prior=prior,

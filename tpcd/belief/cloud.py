@@ -65,9 +65,9 @@ class SamplerSettings:
     """Newton steps of the modes that are remembered, and of those that did not give up."""
     closing: int = 4
     """Times as many places, modes and draws once no more data are to come (see `refine`)."""
-    closing_passes: int = 2
+    closing_passes: int = 4
     """Times at most that those are drawn, each from where the one before arrived."""
-    closing_worth: float = 30.0
+    closing_worth: float = 1000.0
     """Effective sample size with which they need not be drawn again."""
 
     def __post_init__(self) -> None:

@@ -3,20 +3,23 @@
 A transition takes its start pose as given, and puts an object that would overlap the floor
 onto it before it sets out. So the likelihood of transitions cannot tell that the arm rested at
 its command, without load, where theta lets the object reach into the floor. The start was
-chosen without regard to theta, apart from being free; given theta, it is free with the
-probability that the outline's misfit and the noise of the pose leave a gap everywhere.
+chosen without regard to theta, apart from being free; given theta and all that the data tell of
+the outline's misfit, it is free with the probability that misfit and noise leave a gap.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.belief.history import History
+from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import PARITY_LIMIT, Setting
-from tpcd.contact import terrain_gaps
 from tpcd.effects.conditions import angle_difference
+from tpcd.planar import perpendicular, rotate
 
 
 def free_starts(history: History) -> Int[Tensor, " f"]:
@@ -28,32 +31,64 @@ def free_starts(history: History) -> Int[Tensor, " f"]:
     return torch.nonzero(first & history.used & (square < PARITY_LIMIT)).flatten()
 
 
-def log_free(
+@dataclass(frozen=True)
+class StartGaps:
+    """Gaps of the outlines of m particles to t terrains at f rows, without misfit."""
+
+    gap: Float[Tensor, "m f t"]
+    """Of the nearest point [m]; below zero where it is inside of the terrain."""
+    variance: Float[Tensor, "m f t"]
+    """What the noise of the pose makes of it [m^2]."""
+    angle: Float[Tensor, " f"]
+    """Angle of the object that tells which bumps of the misfit act [rad]."""
+
+    def log_free(
+        self,
+        field: MisfitField,
+        sd: Float[Tensor, " m"],
+        mean: Float[Tensor, "m c"],
+        covariance: Float[Tensor, "m c c"],
+    ) -> Float[Tensor, " m"]:
+        """Log probability that nothing is touched, with what is known of the field; -inf for a
+        particle that is not finite.
+
+        Starts of several recordings are much alike, and so is the misfit there: the least
+        likely one counts for all.
+        """
+        gap, variance = self.gap, self.variance
+        if field.bumps:
+            gap = gap + field.gap(mean[:, None], self.angle)
+            variance = variance + field.gap_variance(covariance, sd, self.angle)
+        each = torch.special.log_ndtr(gap / variance.sqrt())
+        total = each.amin(-2).sum(-1)
+        return torch.where(torch.isfinite(total), total, -torch.inf)
+
+    def log_free_before(self, field: MisfitField, sd: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+        """The same before any data: no more than that can all of them together be likely."""
+        count = field.bumps * self.gap.shape[-1]
+        mean = sd.new_zeros(len(sd), count)
+        diagonal = (sd**2)[:, None].expand(-1, count)
+        return self.log_free(field, sd, mean, torch.diag_embed(diagonal))
+
+
+def start_gaps(
     points_ee: Float[Tensor, "m p 2"],
     setting: Setting,
-    misfit_sd: Float[Tensor, " m"],
+    angles: Float[Tensor, " r"],
     rows: Int[Tensor, " f"],
-) -> Float[Tensor, " m"]:
-    """Log probability that the object touches nothing at the rows, whose poses are measured.
-
-    -inf for a particle that is not finite.
-    """
+) -> StartGaps:
+    """Gaps at some rows, whose measured poses have the `angles`."""
     conditions, merged = setting.conditions, setting.merged
-    scene = conditions.scene(points_ee[:, None])
-    if scene.batch_shape[1] > 1:
-        scene = scene.columns(rows)
-    turn, normal = (_at(value, rows) for value in (conditions.turn, conditions.normal))
-    turned = torch.cat((torch.zeros_like(turn), torch.zeros_like(turn), turn), dim=-1)
-    variance = merged.variance[:, rows]
-    gaps, levers = terrain_gaps(scene.points_ee, scene.terrains, merged.poses[:, rows] + turned)
-    gap, lowest = gaps.min(-1)
-    lever = levers.gather(-1, lowest[..., None])[..., 0]
+    normal, offset, turn = (
+        value if value.shape[1] == 1 else value[:, rows]
+        for value in (conditions.normal, conditions.offset, conditions.turn)
+    )
+    pose, variance = merged.poses[:, rows], merged.variance[:, rows]
+    m, f, t = len(points_ee), len(rows), offset.shape[-1]
+    towards = rotate(-(pose[..., 2:] + turn), normal).expand(m, f, t, 2).flatten(1, 2)
+    lowest, index = torch.bmm(towards, points_ee.mT).min(-1)
+    point = points_ee.gather(1, index[..., None].expand(-1, -1, 2))
+    lever = (towards * perpendicular(point)).sum(-1).unflatten(1, (f, t))
     noise = (normal**2 * variance[:, :, None, :2]).sum(-1) + lever**2 * variance[..., 2:]
-    each = torch.special.log_ndtr(gap / (noise + misfit_sd[:, None, None] ** 2).sqrt())
-    total = each.sum((-1, -2))
-    return torch.where(torch.isfinite(total), total, -torch.inf)
-
-
-def _at(value: Tensor, rows: Tensor) -> Tensor:
-    """The value (m, r, ...) at some rows; r may be 1."""
-    return value if value.shape[1] == 1 else value[:, rows]
+    gap = lowest.unflatten(1, (f, t)) + (normal * pose[:, :, None, :2]).sum(-1) - offset
+    return StartGaps(gap, noise, angles[rows])

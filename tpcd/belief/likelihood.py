@@ -28,7 +28,7 @@ from torch import Tensor
 
 from tpcd.belief.compiled import compiled_filter
 from tpcd.belief.filtered import HistoryLikelihood, Steps, filter_history
-from tpcd.belief.free_start import free_starts, log_free
+from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import Setting, merge
@@ -83,18 +83,23 @@ def history_likelihood(
         setting, _ = effective_setting(scene, history, misfit_sd, field, settings, added, outcome)
         read = history.read
         further = setting.merged.log_parity(read) - history.merged.log_parity(read)
-    begins = free_starts(history)
+        least = None if least is None else least - further
+    starts, begins = None, free_starts(history)
     if len(begins):
-        further = further + log_free(scene.points_ee, setting, misfit_sd, begins)
-    # What is impossible already need not be stepped.
-    least = None if least is None else torch.where(further > -torch.inf, least - further, torch.inf)
+        starts = start_gaps(scene.points_ee, setting, history.poses[:, 2], begins)
+        if least is not None:
+            highest = starts.log_free_before(field, misfit_sd) + setting.highest_terms.sum(-1)
+            least = torch.where(highest > least, least, torch.inf)
     arguments = (scene.points_ee, setting, misfit_sd, field, settings)
     if compiled:
         found = compiled_filter(*arguments, least, innovations)
     else:
         found = filter_history(*arguments, innovations)
-    total = torch.where(further > -torch.inf, found.total + further, -torch.inf)
-    return replace(found, total=total)
+    if starts is not None:
+        further = further + starts.log_free(
+            field, misfit_sd, found.field_mean, found.field_covariance
+        )
+    return replace(found, total=found.total + further)
 
 
 def effective_setting(

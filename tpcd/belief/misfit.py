@@ -67,6 +67,22 @@ class MisfitField:
         each = coefficients.unflatten(-1, (-1, self.bumps))
         return (each * self.basis(angle)[0][..., None, :]).sum(-1)
 
+    def gap_variance(
+        self,
+        covariance: Float[Tensor, "m c c"],
+        sd: Float[Tensor, " m"],
+        angle: Float[Tensor, " n"],
+    ) -> Float[Tensor, "m n t"]:
+        """Variance of the gap to each of t terrains [m^2] at n angles, for coefficients of a
+        `covariance` [m^2] and a misfit of standard deviation `sd` [m]."""
+        value, _ = self.basis(angle)
+        t = covariance.shape[-1] // self.bumps
+        blocks = covariance.unflatten(-1, (t, -1)).unflatten(1, (t, -1))
+        own = blocks.diagonal(dim1=1, dim2=3)
+        known = torch.einsum("na,mabt,nb->mnt", value, own, value)
+        uncovered = (1 - (value**2).sum(-1)).clamp_min(0.0)
+        return known + (sd**2)[:, None, None] * uncovered[:, None]
+
     def basis(
         self, angle: Float[Tensor, "*batch"]
     ) -> tuple[Float[Tensor, "*batch j"], Float[Tensor, "*batch j"]]:

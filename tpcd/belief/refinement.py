@@ -4,8 +4,9 @@ After each transition the sampler spends little, which is enough to choose the n
 is left of an episode is the belief after its last transition, and that one may cost more: with ten
 data the draws of `budget` are worth about ten, and their intervals are too narrow.
 
-One pass of more draws is enough for seven episodes in ten. In the others a few draws come
-upon a place that the mixture hardly reaches and outweigh the rest; a further pass begins there.
+One pass of more draws is not enough: the sheet on which theta is likely is long, and each pass
+reaches further along it. On 60 drawn episodes 82, 84, 85, 86 and 86 % of the 90 % intervals held
+the truth after one to five passes, though the evidence hardly grew.
 """
 
 from __future__ import annotations

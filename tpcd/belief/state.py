@@ -21,8 +21,8 @@ from tpcd.data.episode import Episode
 from tpcd.errors import RunError
 
 STATE_FILE = "state.safetensors"
-STATE_VERSION = "3"
-"""Changes with what an estimator keeps."""
+STATE_VERSION = "4"
+"""Changes with what an estimator keeps, and with what its likelihoods mean."""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class ContactTarget:
         self, score: Float[Tensor, "m s"]
     ) -> tuple[Float[Tensor, "m s"], Float[Tensor, "m s s"]]:
         """Gradient of the log posterior and its Fisher information, from the derivatives of
-        the innovations.
+        the innovations. What a free start says is left out.
 
         Entries that cannot be evaluated count as flat.
         """

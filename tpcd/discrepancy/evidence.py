@@ -27,6 +27,7 @@ from tpcd.belief.modes import find_modes
 from tpcd.belief.pool import known_weights, truncate
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.state import STATE_VERSION
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.memory import Memory, digest
 from tpcd.effects.protocol import Effect
@@ -63,6 +64,7 @@ class Question:
         """Of all that answers depend on."""
         history, scene = self.history, self.scene
         return digest(
+            STATE_VERSION,
             *(history.commands, history.readings, history.sensor_variance, history.stiffness),
             *(history.used, history.seams, history.parity_counts, scene.low, scene.high),
             *(type(scene.shape).__name__, scene.shape.latent_dim, scene.shape.misfit_sd),

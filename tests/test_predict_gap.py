@@ -1,0 +1,121 @@
+"""Predictions with a known misfit, against steps with the gap of the angle that is reached.
+
+The object is pressed off its centre, so that it settles beside the commanded angle, and
+the field changes with the angle: what the predictor adds to its step counts.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tpcd.belief.belief import Belief
+from tpcd.belief.misfit import MisfitField
+from tpcd.belief.prior import make_prior
+from tpcd.contact import scene_from_parameters
+from tpcd.effects.catalogue import find_effect
+from tpcd.parameters import Parameters
+from tpcd.predict import ContactPredictor
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings, simulate_step
+
+FIELD = MisfitField(sd=1e-3)
+STIFFNESS = torch.tensor([1000.0, 1000.0, 10.0], dtype=torch.float64)
+THETA = torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.18]], dtype=torch.float64)
+COEFFICIENTS = 5e-4 * torch.tensor(
+    [[0.3, 1.0, 0.4, -1.0, 0.2, 1.0, -0.3, -0.6, 0.7, 0.4, -0.3, 0.9, -0.8, 0.1]],
+    dtype=torch.float64,
+)
+"""Of floor and wall [m]."""
+TOLERANCE = 1.5e-5
+
+
+@pytest.fixture(scope="module")
+def shape() -> PolygonShape:
+    return PolygonShape(builtin_outlines()["milk_carton"])
+
+
+@pytest.fixture(scope="module")
+def moves(shape: PolygonShape) -> tuple[Tensor, Tensor]:
+    """Start poses, which are commands as well, and commands: onto the floor on one corner."""
+    z = -float(shape.outline.vertices[:, 1].min())
+    starts = torch.tensor([[0.0, z + 0.02, 0.15], [0.0, z + 0.02, -0.12]], dtype=torch.float64)
+    down = torch.tensor([[0.0, z - 0.012, 0.15], [0.01, z - 0.010, -0.12]], dtype=torch.float64)
+    return starts, down
+
+
+@pytest.fixture(scope="module")
+def expected(shape: PolygonShape, moves: tuple[Tensor, Tensor]) -> Tensor:
+    """Where the moves end with the field at the angle that is reached."""
+    scene = scene_from_parameters(shape, Parameters.from_vector(THETA))
+    coefficients = COEFFICIENTS[0]
+    ends = []
+    for start, command in zip(*moves, strict=True):
+        angle = command[2]
+        for _ in range(40):
+            gap = FIELD.gap(coefficients, angle)[None]
+            there = simulate_step(scene.further(gap), start, command, STIFFNESS, previous=start)
+            slope = coefficients.reshape(2, -1) @ FIELD.basis(angle)[1]
+            pose = there.pose[0] + (there.pose_from_lever[0] * slope[:, None]).sum(0)
+            angle = 0.5 * (angle + pose[2])
+        ends.append(pose)
+    return torch.stack(ends)
+
+
+@pytest.fixture(
+    scope="module", params=[(), ("force_bias",), ("floor_compliance",)], ids=["", "bias", "soft"]
+)
+def predictor(request: pytest.FixtureRequest, shape: PolygonShape) -> ContactPredictor:
+    """Of one particle that knows its field, with effects that do nothing."""
+    prior = make_prior(shape, effects=[find_effect(name) for name in request.param])
+    null = torch.zeros(1, len(prior.names) - THETA.shape[1], dtype=torch.float64)
+    size = COEFFICIENTS.shape[1]
+    belief = Belief(
+        prior=prior,
+        vectors=torch.cat((THETA, null), dim=-1),
+        weights=torch.ones(1, dtype=torch.float64),
+        misfit=FIELD,
+        misfit_sd=torch.tensor([1e-5], dtype=torch.float64),
+        misfit_mean=COEFFICIENTS,
+        misfit_covariance=torch.zeros(1, size, size, dtype=torch.float64),
+        step=StepSettings(),
+        stiffness=STIFFNESS,
+        log_evidence=0.0,
+        log_evidence_std=0.0,
+    )
+    return ContactPredictor(belief)
+
+
+def test_the_moves_turn_the_object_and_the_field_matters(
+    shape: PolygonShape, moves: tuple[Tensor, Tensor], expected: Tensor
+) -> None:
+    scene = scene_from_parameters(shape, Parameters.from_vector(THETA))
+    starts, commands = moves
+    without = simulate_step(scene, starts, commands, STIFFNESS, previous=starts).pose
+    assert float((expected[:, 2] - commands[:, 2]).abs().min()) > 5e-3
+    assert float((without - expected)[:, :2].abs().amax(-1).min()) > 3 * TOLERANCE
+    # Also what the field changes between the commanded angle and the one that is reached.
+    coefficients = COEFFICIENTS.expand(2, -1)
+    here = FIELD.gap(coefficients, commands[:, 2])
+    there = FIELD.gap(coefficients, expected[:, 2])
+    assert float((there - here)[:, 0].abs().max()) > 2 * TOLERANCE
+
+
+def test_predictions_end_there(
+    predictor: ContactPredictor, moves: tuple[Tensor, Tensor], expected: Tensor
+) -> None:
+    starts, commands = moves
+    both = predictor.predict(starts, commands, previous=starts)
+    torch.testing.assert_close(both.mean[:, :3], expected, atol=TOLERANCE, rtol=0.0)
+
+
+def test_rollouts_end_there(
+    predictor: ContactPredictor, moves: tuple[Tensor, Tensor], expected: Tensor
+) -> None:
+    for start, command, end in zip(*moves, expected, strict=True):
+        drawn = predictor.rollout(
+            start, command[None], torch.Generator().manual_seed(0), samples=3, previous=start
+        )
+        torch.testing.assert_close(drawn[:, 0, :3], end.expand(3, 3), atol=TOLERANCE, rtol=0.0)

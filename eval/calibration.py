@@ -8,12 +8,12 @@ transition starts at the true pose of the row before and settles against terrain
 further away by the misfit, of which each run has one field and one size; what the field's
 slope does to the lever is linear. Pose and wrench are measured with noise.
 Commands depend on earlier measurements only (tpcd/truth/motions.py), which no posterior
-minds, and the start pose is drawn without regard to theta, as long as the object is free
-there and near the floor, which the first data say anyway. What is not exact: the filter's
-linearisation in the start pose and in what is not known of the misfit yet; a misfit so large
-that the angle at which it is read does not settle (some centimetres; keep `--misfit` to
-millimetres); the robust treatment of outliers and of bad parity, which concerns about 1 datum
-in 1000 each. With `--estimator paper` the data are
+minds, and the start pose is drawn without regard to theta and misfit, as long as the object is
+free there, which the likelihood knows, and near the floor, which the first data say. What is
+not exact: the filter's linearisation in the start pose and in what is not known of the misfit
+yet; a misfit so large that the angle at which it is read does not settle (some centimetres;
+keep `--misfit` to millimetres); the robust treatment of outliers and of bad parity, which
+concerns about 1 datum in 1000 each. With `--estimator paper` the data are
 the same, while that filter assumes another noise: its ranks show what this costs.
 
 python -m eval.calibration --runs 200 --steps 10 --out runs/calibration

@@ -81,7 +81,8 @@ def filter_history(
             continue
         begins, ends = (_turn(conditions.turn, row) for row in (k, k + 1))
         here = _column(scene, k + 1)
-        # What the field changes is known in part, and contact there is not as without it.
+        # What the field changes is known in part, and contact there is not as without it. The gap
+        # at the end's angle serves for the start as well.
         if count:
             gap = field.gap(state.mean[:, :count], setting.angles[k])
             here = here.further(gap)

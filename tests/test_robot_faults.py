@@ -139,6 +139,26 @@ def test_a_force_about_the_limit_does_not_end_a_retreat() -> None:
     np.testing.assert_allclose(raised, (0.0, ArmSettings("nowhere").retreat, 0.0), atol=1e-9)
 
 
+def test_a_retreat_between_two_blows_of_a_swing_goes_on() -> None:
+    """It began at 1 N, and the surface strikes once more with what it had struck with before."""
+    frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
+    place = np.array([0.1, 0.1, 0.0])
+
+    def retreat(forces: tuple[float, ...]) -> np.ndarray:
+        link = FollowingLink(tcp_pose(frame, place), forces)
+        servo = Servo(ArmSettings("nowhere"), link, frame, RawRecord())
+        servo.state = at_rest(place, np.zeros(3))
+        for _ in range(20):
+            servo.read()
+        return servo.retreat() - place
+
+    swing = (1.0,) * 9 + (17.5,) + (1.0,) * 10
+    raised = retreat((*swing, 1.0, 17.5, 1.0))
+    np.testing.assert_allclose(raised, (0.0, ArmSettings("nowhere").retreat, 0.0), atol=1e-9)
+    with pytest.raises(RobotError, match="met a force of 17.5"):
+        retreat((*(1.0,) * 20, 1.0, 17.5, 1.0))
+
+
 @pytest.mark.parametrize(
     ("pose", "force", "said"),
     [

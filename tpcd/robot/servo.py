@@ -6,6 +6,7 @@ recorded, whatever the arm is doing.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -41,6 +42,8 @@ RAMP_SPEED = 0.03
 """Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
 RAMP_FORCE, RETREAT_FORCE = 4.0, 10.0
 """Further force that ends a move in free air, and a retreat, at whose start friction turns [N]."""
+RECENT = 0.5
+"""An arm that swings may begin its retreat between two blows: so far back it looks for them [s]."""
 SLOWER_TURNS = 3
 """How often the damping of the angle is doubled before an oscillation ends the run."""
 GENTLE = 2.5
@@ -63,6 +66,8 @@ class Servo:
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
         self._over, self._retreating, self._slower = 0, False, 0
+        self._felt: deque[np.ndarray] = deque(maxlen=max(1, round(RECENT * link.rate)))
+        """Sizes of the last forces (2) [N]."""
         self._command: np.ndarray | None = None
         """The last one given way to; None where the arm went elsewhere since."""
 
@@ -73,6 +78,7 @@ class Servo:
         pose, wrench = planar_pose(frame, sample.tcp), planar_wrench(frame, sample.wrench)
         reference = pose if state is None else state.reference
         self._raw.add(sample, pose, wrench, reference)
+        self._felt.append(np.abs(wrench[:2]))
         limit = self.settings.stop_force * np.array([1.0, 1.0, 0.2])
         over = bool((np.abs(wrench) > limit).any()) and not self._retreating
         self._over = self._over + 1 if over else 0
@@ -102,19 +108,25 @@ class Servo:
         table = np.array(rows)
         return FreeAir(table[:, 0], table[:, 1:4], table[:, 4:7])
 
-    def ramp_to(self, goal: Float[np.ndarray, " 3"], allowed: float = RAMP_FORCE) -> None:
-        """Straight to a pose; RobotError where a force grows by more than `allowed` [N]."""
+    def ramp_to(
+        self,
+        goal: Float[np.ndarray, " 3"],
+        allowed: float = RAMP_FORCE,
+        before: Float[np.ndarray, " 2"] | None = None,
+    ) -> None:
+        """Straight to a pose; RobotError where a force grows by more than `allowed` [N] beyond what
+        it was `before`, by default at the first reading."""
         link, frame = self.link, self.frame
         self._command = None
-        before: np.ndarray | None = None
         waited = 0
         while waited < 0.3 * link.rate:
             _, pose, wrench = self.read()
             state = self.state or at_rest(pose, np.zeros(3))
-            before = wrench if before is None else before
-            if float((np.abs(wrench) - np.abs(before))[:2].max()) > allowed:
+            force = np.abs(wrench[:2])
+            before = force if before is None else before
+            if float((force - before).max()) > allowed:
                 raise RobotError(
-                    f"the arm met a force of {np.abs(wrench[:2]).max():.1f} N on its way through"
+                    f"the arm met a force of {force.max():.1f} N on its way through"
                     " what should be free air"
                 )
             way = goal - state.reference
@@ -133,13 +145,14 @@ class Servo:
         assert self.state is not None, "never moved"
         settings, here = self.settings, self.state.reference
         self._retreating = True  # The limit may be exceeded still: the ramp looks to the force.
+        felt = np.max(self._felt, axis=0) if self._felt else None
         left = -1.0 if float(self.state.wrench[0]) < -1.0 else 0.0
         low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
         try:
             for way in (np.array([left, 1.0, 0.0]), np.array([0.0, 1.0, 0.0])):
                 goal = here + 0.5 * settings.retreat * way
                 goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
-                self.ramp_to(goal, RETREAT_FORCE)
+                self.ramp_to(goal, RETREAT_FORCE, felt)
                 here = self.state.reference
         finally:
             self._retreating = False

@@ -153,7 +153,7 @@ class Servo:
                 goal = here + 0.5 * settings.retreat * way
                 goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
                 self.ramp_to(goal, RETREAT_FORCE, felt)
-                here = self.state.reference
+                here, felt = self.state.reference, None
         finally:
             self._retreating = False
         return here

@@ -33,9 +33,9 @@ def shape() -> PolygonShape:
     return PolygonShape(builtin_outlines()["milk_carton"])
 
 
-def theta(floor: Tensor, wall: float = 0.18, angle: float = 0.0) -> Tensor:
+def theta(floor: Tensor, wall: float = 0.18) -> Tensor:
     """Particles that differ in the height of the floor [m]."""
-    rest = torch.tensor([1.0, 0.0, 0.0, angle, 0.5, 0.0, wall], dtype=torch.float64)
+    rest = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.5, 0.0, wall], dtype=torch.float64)
     vectors = rest.expand(len(floor), 7).clone()
     vectors[:, 5] = floor
     return vectors

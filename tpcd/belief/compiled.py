@@ -55,6 +55,7 @@ def compiled_filter(
             for value in _alike(conditions.normal, conditions.offset_seen, conditions.friction)
         ),
         settings.substeps,
+        settings.finest,
         settings.largest_turn,
         settings.follow_path,
     )

@@ -76,6 +76,7 @@ class Given(NamedTuple):
     offsets: np.ndarray
     friction: np.ndarray
     substeps: int
+    finest: float
     largest_turn: float
     follow_path: bool
 
@@ -145,6 +146,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         commands,
         False,
         given.substeps,
+        given.finest,
         given.largest_turn,
         given.follow_path,
     )

@@ -59,6 +59,7 @@ def finer_steps(question: Question) -> Question:
         step,
         substeps=FINER * step.substeps,
         largest_turn=step.largest_turn / FINER,
+        finest=step.finest / FINER,
         follow_path=True,
     )
     return replace(question, step=finer)

@@ -22,12 +22,22 @@ from tpcd.simulator.kernel_slopes import (
     landing_response,
     settling_response,
 )
-from tpcd.simulator.path import ALMOST
+from tpcd.simulator.kernel_walk import (
+    contact_modes,
+    ends_alike,
+    part_end,
+    parts_of_path,
+    sticking,
+)
+from tpcd.simulator.walk import ALMOST
 from tpcd.simulator.wedge import LIGHTER
 
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
 """Attempts at settling (see `wedge`): as it is; what may be wedged or is jammed, without friction;
 from there with it again; if that is no better, as it is after all, or what jams without it."""
+
+RESTING, STRAIGHT, WALKING, STRAIGHT_AFTER_ALL = 0, 1, 2, 3
+"""Stages of a step."""
 
 
 @njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
@@ -64,48 +74,28 @@ def step_element(
     for a in range(3):
         pose[a] = start[a]
         whole[a, a] = 1.0
-    touched, status, residual, relaxed = 0, CONVERGED, 0.0, False
-    # Run 0 puts the start on what it rests against, run 1 goes straight to the command,
-    # runs 2.. follow the command's path where contact has changed, or what is touched turns, and
-    # the last one goes straight again where that went worse.
+    # First the start is put on what it rests against, then the whole way is gone at once; in parts
+    # where contact changes or what is touched turns, and at once again if that went worse.
     rested, parts, straight = request.rested, 1, CONVERGED
-    run, last = (1 if rested else 0), 1
+    modes, status, residual, relaxed = 0, CONVERGED, 0.0, False
+    stage, done, length = (STRAIGHT if rested else RESTING), 0.0, 1.0
     if rested:
-        touched = touching(world, o, chains, pose)
-    while run <= last:
-        if run == 1:
-            copy_rows(whole, 0, slopes.kept, height)
-            copy_rows(theta, 0, slopes.theta_kept, entries)
-            for a in range(3):
-                kept_pose[a] = pose[a]
-            share = 1.0
-        elif run == 0:
-            share = 0.0
-        else:
-            share = (run - 1) / parts if parts > 1 else 1.0
-        if run == 2 or run > 2 and parts == 1:
-            copy_rows(slopes.kept, 0, whole, height)
-            copy_rows(slopes.theta_kept, 0, theta, entries)
-            for a in range(3):
-                pose[a] = kept_pose[a]
-            status, residual = CONVERGED, 0.0
+        modes = sticking(touching(world, o, chains, pose), terrains)
+        _keep(slopes, pose, kept_pose, height, entries)
+    while True:
+        share = 0.0 if stage == RESTING else 1.0
+        if stage == WALKING:
+            share = part_end(done, length, parts)
         for a in range(3):
             part[a] = before[a] + share * (command[a] - before[a]) if share < 1.0 else command[a]
             start[a] = pose[a]
-        follows = 1.0 - share if rested else 0.0
+        follows, ended, left, now = 1.0 - share if rested else 0.0, CONVERGED, 0.0, 0
         fraction, point, terrain = first_touch(world, o, chains, start, part)
+        relaxed = False
         for a in range(3):
             landing[a] = start[a] + fraction * (part[a] - start[a])
-            pose[a] = landing[a]
-        if fraction == 1.0:
-            for a in range(3):
-                pose[a] = part[a]
-                space.chosen[a, 0] = -1
-            whole[:], theta[:] = 0.0, 0.0
-            for a in range(3):
-                whole[a, a] = follows
-        else:
-            landing_response(world, o, start, part, fraction, point, terrain, slopes)
+            pose[a] = landing[a] if fraction < 1.0 else part[a]
+        if fraction < 1.0:
             attempt, first, most = PLAIN, CONVERGED, np.inf
             while True:
                 ended, left = settle(
@@ -116,7 +106,7 @@ def step_element(
                     load += space.multiplier[j]
                 if attempt == PLAIN:
                     first, most = ended, load
-                    if not may_wedge(world, o, law, space) and ended != RELAXED:
+                    if not may_wedge(law, space) and ended != RELAXED:
                         break
                 following = _after(attempt, first, ended, law.coulomb, load < LIGHTER * most)
                 if following == attempt:
@@ -128,12 +118,30 @@ def step_element(
                     world.friction[o, t] = 0.0 if loose else space.friction[t]
                 attempt = following
             relaxed = attempt == FRICTIONLESS
+            now = contact_modes(space, terrains)
+        short = stage != WALKING or share - done <= request.finest * (1.0 + ALMOST)
+        if not short and not ends_alike(modes, now, terrains):
+            for a in range(3):
+                pose[a] = start[a]
             if relaxed:
-                if ended == RELAXED:
-                    status = JAMMED
-                    break
-                ended = RELAXED
+                for t in range(terrains):
+                    world.friction[o, t] = space.friction[t]
+            length = max(0.5 * (share - done), request.finest)
+            continue
+        if relaxed:
+            if ended == RELAXED:
+                status = JAMMED
+                break
+            ended = RELAXED
+        if fraction == 1.0:
+            for a in range(3):
+                space.chosen[a, 0] = -1
+            whole[:], theta[:] = 0.0, 0.0
+            for a in range(3):
+                whole[a, a] = follows
+        else:
             status, residual = max(status, ended), max(residual, left)
+            landing_response(world, o, start, part, fraction, point, terrain, slopes)
             turn = (math.cos(pose[2]), math.sin(pose[2]))
             linear_system(world, o, law, part, pose, turn, space)
             settling_response(law, terrains, space, slopes)
@@ -144,24 +152,28 @@ def step_element(
             if relaxed:
                 for t in range(terrains):
                     world.friction[o, t] = space.friction[t]
-        if run == 0:
-            touched, status, residual = _loaded(space), CONVERGED, 0.0
-        elif run == 1 and request.substeps > 1:
-            now = _loaded(space)
-            changed = now != 0 and now != touched
-            if request.follow_path or changed and (touched != 0 or now & (now - 1) != 0):
-                parts = request.substeps
-            if now != 0 or touched != 0:
-                turns = abs(command[2] - before[2]) / request.largest_turn
-                parts = max(parts, math.ceil(turns - ALMOST))
-            if parts > 1:
-                straight, last = status, parts + 1
-        elif run > 1 and run == last and status > straight:
-            parts, straight, last = 1, status, last + 1
-        run += 1
+        if stage == RESTING:
+            modes, status, residual, stage = now, CONVERGED, 0.0, STRAIGHT
+            _keep(slopes, pose, kept_pose, height, entries)
+        elif stage == STRAIGHT:
+            parts = parts_of_path(request, command[2] - before[2], modes, now, terrains)
+            if parts == 1:
+                break
+            stage, straight, length = WALKING, status, 1.0 / parts
+            _restore(slopes, pose, kept_pose, height, entries)
+            status, residual = CONVERGED, 0.0
+        elif stage == WALKING and share < 1.0:
+            length = 1.0 / parts if ends_alike(modes, now, terrains) else request.finest
+            modes, done = now, share
+        elif stage == WALKING and status > straight:
+            stage, status, residual = STRAIGHT_AFTER_ALL, CONVERGED, 0.0
+            _restore(slopes, pose, kept_pose, height, entries)
+        else:
+            break
     for a in range(3):
         answer.poses[b, a] = pose[a]
-    _modes(space, answer.modes, b)
+    for t in range(terrains):
+        answer.modes[b, t] = now >> 2 * t & 3
     _contacts(world, o, pose, space, answer.contacts, b)
     if relaxed:
         answer.contacts[b, :, 1] = 0.0
@@ -188,28 +200,22 @@ def _after(attempt, first, ended, coulomb, lighter):
 
 @njit(_nrt=False)
 @no_type_check
-def _loaded(space):
-    """Bit mask of the terrains that carry load."""
-    mask = 0
-    for j in range(3):
-        if space.chosen[j, 0] >= 0:
-            mask |= 1 << space.chosen[j, 1]
-    return mask
+def _keep(slopes, pose, kept_pose, height, entries):
+    """Keep the state that the path begins in."""
+    copy_rows(slopes.whole, 0, slopes.kept, height)
+    copy_rows(slopes.theta, 0, slopes.theta_kept, entries)
+    for a in range(3):
+        kept_pose[a] = pose[a]
 
 
 @njit(_nrt=False)
 @no_type_check
-def _modes(space, modes, b):
-    """Contact mode against each terrain, from the row that carries the largest load."""
-    for t in range(modes.shape[1]):
-        modes[b, t] = 0
-        largest = 0.0
-        for j in range(3):
-            load = space.multiplier[j]
-            if space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t and load > largest:
-                largest = load
-                slip = 2 if space.side[j] < 0.0 else 3
-                modes[b, t] = slip if space.slipping[j] else 1
+def _restore(slopes, pose, kept_pose, height, entries):
+    """Go back to the state that the path begins in."""
+    copy_rows(slopes.kept, 0, slopes.whole, height)
+    copy_rows(slopes.theta_kept, 0, slopes.theta, entries)
+    for a in range(3):
+        pose[a] = kept_pose[a]
 
 
 @njit(error_model="numpy", _nrt=False)

@@ -29,6 +29,7 @@ class Request(NamedTuple):
     commands: np.ndarray
     rested: bool
     substeps: int
+    finest: float
     largest_turn: float
     follow_path: bool
 

@@ -18,7 +18,7 @@ from tpcd.qp.problem import Status
 from tpcd.simulator.kernel_geometry import lowest_point, object_normal
 from tpcd.simulator.kernel_linear import linear_system, respond
 from tpcd.simulator.kernel_space import LIST
-from tpcd.simulator.wedge import PATIENCE, WEDGE
+from tpcd.simulator.wedge import PATIENCE
 
 NEWTON_ROUNDS = 6
 """Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
@@ -88,8 +88,8 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
 
 @njit(_nrt=False)
 @no_type_check
-def may_wedge(world, o, law, space):
-    """Whether two terrains load the settled element that can press on each other through it."""
+def may_wedge(law, space):
+    """Whether two terrains load the settled element, which can press on each other through it."""
     first, second = -1, -1
     for j in range(3):
         if space.chosen[j, 0] >= 0:
@@ -98,9 +98,7 @@ def may_wedge(world, o, law, space):
                 first = t
             else:
                 second = t
-    if second < 0 or not law.coulomb:
-        return False
-    return world.friction[o, first] * world.friction[o, second] >= WEDGE
+    return second >= 0 and law.coulomb
 
 
 @njit(_nrt=False, forceinline=True)

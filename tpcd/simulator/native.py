@@ -200,6 +200,7 @@ def request_of(
         _flat(command.detach(), 3),
         previous is None,
         settings.substeps,
+        settings.finest,
         settings.largest_turn,
         settings.follow_path,
     )

@@ -16,10 +16,9 @@ from tpcd.simulator.implicit import linear_response, loaded_frames, newton_pose
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus, Transition
 from tpcd.simulator.settle import Settled, own
+from tpcd.simulator.walk import ALMOST, ends_alike, part_end, parts_of_path
 from tpcd.simulator.wedge import settle
 
-ALMOST = 1e-9
-"""Share of a part that is no part of its own."""
 GRAZING = 1e-9
 """Share of the way's motion towards a terrain below which a touch only grazes it."""
 
@@ -60,15 +59,16 @@ def follow_path(
     settings: StepSettings,
 ) -> Transition:
     """Step finite elements (b): rest on what was touched, go to the command, and in parts along its
-    path where contact changes on the way or turns, unless the parts end worse than the whole."""
+    path where contact changes on the way or what is touched turns (see `walk`), unless the parts
+    end worse than the whole."""
     start, stiffness, scene = start.double(), stiffness.double(), scene.double()
     command = _unwrapped(command.double(), start)
     begin = _start_state(scene, start)
     rested = previous is None
     if rested:
         gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
-        touching = gaps[..., 0] <= FREE_GAP
-        path_start = start
+        sticks = (gaps[..., 0] <= FREE_GAP).long() * int(ContactMode.STICK)
+        begin, path_start = replace(begin, mode=sticks), start
     else:
         path_start = _unwrapped(previous.double(), start)
         begin = _advance(scene, begin, path_start, 0.0, stiffness, settings)
@@ -77,32 +77,12 @@ def follow_path(
             status=torch.zeros_like(begin.status),
             residual=torch.zeros_like(begin.residual),
         )
-        touching = begin.mode > 0
-    # How much the command of a part moves with the start pose.
-    follows = 1.0 if rested else 0.0
     end = _advance(scene, begin, command, 0.0, stiffness, settings)
-    loaded = end.mode > 0
-    changed = loaded.any(-1) & (loaded != touching).any(-1)
-    winding = changed & (touching.any(-1) | (loaded.sum(-1) > 1))
-    if settings.follow_path:
-        winding = torch.ones_like(winding)
-    turns = (command - path_start)[:, 2].detach().abs() / settings.largest_turn
-    turns = torch.where((loaded | touching).any(-1), (turns - ALMOST).ceil(), 1.0).long()
-    parts = torch.where(winding, settings.substeps, 1).maximum(turns)
-    if settings.substeps > 1 and bool((parts > 1).any()):
-        state = begin
-        for k in range(1, int(parts.max()) + 1):
-            index = torch.nonzero((parts >= k) & (parts > 1)).flatten()
-            share = (k / parts[index])[:, None]
-            target = path_start[index] + share * (command[index] - path_start[index])
-            target = torch.where(share < 1, target, command[index])
-            here = _State(**{name: value[index] for name, value in vars(state).items()})
-            rest = (follows * (1 - share))[..., None]
-            there = _advance(
-                scene.gather(index), here, target, rest, own(stiffness, index), settings
-            )
-            state = state.put(index, there)
-        end = state.where((parts > 1) & (state.status <= end.status), end)
+    turn = (command - path_start)[:, 2].detach()
+    parts = parts_of_path(settings, turn, begin.mode, end.mode)
+    if bool((parts > 1).any()):
+        walked = _walk(scene, begin, path_start, command, parts, rested, stiffness, settings)
+        end = walked.where((parts > 1) & (walked.status <= end.status), end)
     return Transition(
         pose=torch.cat((end.pose[:, :2], wrap_angle(end.pose[:, 2:])), dim=-1),
         wrench=stiffness * (end.pose - command),
@@ -114,6 +94,42 @@ def follow_path(
         pose_from_lever=end.from_lever,
         contacts=end.contacts,
     )
+
+
+def _walk(
+    scene: ContactScene,
+    state: _State,
+    path_start: Tensor,
+    command: Tensor,
+    parts: Tensor,
+    rested: bool,
+    stiffness: Tensor,
+    settings: StepSettings,
+) -> _State:
+    """The end of the path in parts, for the elements that have more than one."""
+    done = torch.where(parts > 1, 0.0, torch.ones_like(command[:, 0]))
+    longest = 1.0 / parts.to(done)
+    length = longest.clone()
+    while bool((done < 1).any()):
+        index = torch.nonzero(done < 1).flatten()
+        share = part_end(done[index], length[index], parts[index])
+        reach = share[:, None]
+        target = path_start[index] + reach * (command[index] - path_start[index])
+        target = torch.where(reach < 1, target, command[index])
+        here = _State(**{name: value[index] for name, value in vars(state).items()})
+        # How much the command of a part moves with the start pose.
+        follows = ((1 - reach) * rested)[..., None]
+        there = _advance(
+            scene.gather(index), here, target, follows, own(stiffness, index), settings
+        )
+        alike, gone = ends_alike(here.mode, there.mode), share - done[index]
+        fits = alike | (gone <= settings.finest * (1 + ALMOST))
+        shorter = (0.5 * gone).clamp_min(settings.finest)
+        after = torch.where(alike, longest[index], settings.finest)
+        length[index] = torch.where(fits, after, shorter)
+        done[index] = torch.where(fits, share, done[index])
+        state = state.put(index, there.where(fits, here))
+    return state
 
 
 def _unwrapped(command: Tensor, start: Tensor) -> Tensor:

@@ -52,11 +52,14 @@ class StepSettings:
     friction: Literal["coulomb", "anitescu"] = "coulomb"
     """`anitescu` is the convex relaxation (a sliding body is lifted by friction x slip);
     `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
-    substeps: int = 2
-    """Parts into which the command's path is cut where contact with floor or wall is won or
-    lost on the way, since friction then depends on the path. With 1, nothing is ever cut. Where
-    the parts end worse than the whole step (see `StepStatus`), the whole one is the answer."""
-    largest_turn: float = 0.05
+    substeps: int = 4
+    """Parts into which the command's path is cut where contact changes on the way, since friction
+    then depends on the path. With 1, nothing is ever cut. Where the parts end worse than the whole
+    step (see `StepStatus`), the whole one is the answer."""
+    finest: float = 1 / 64
+    """Shortest part, as a share of the path: parts on which contact changes are halved down to it
+    (see `walk`)."""
+    largest_turn: float = 0.025
     """Most that the command turns in one part where anything is touched [rad]: what rolls or
     slips while it turns depends on the path too."""
     follow_path: bool = False
@@ -76,6 +79,8 @@ class StepSettings:
             raise ValueError(
                 f"substeps {self.substeps} and rounds {self.rounds} must both be at least 1"
             )
+        if not 0 < self.finest <= 1:
+            raise ValueError(f"finest is {self.finest}, expected a share above 0 and up to 1")
         if not self.largest_turn > 0:
             raise ValueError(f"largest_turn is {self.largest_turn}, expected radians above 0")
         if self.compliance < 0 or self.tolerance <= 0:

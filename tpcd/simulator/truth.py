@@ -11,7 +11,9 @@ from tpcd.simulator.record import StepSettings, StepStatus
 from tpcd.simulator.step import simulate_step
 from tpcd.terrain import floor, wall
 
-TRUTH_SETTINGS = StepSettings(friction="coulomb", substeps=10, follow_path=True, rounds=40)
+TRUTH_SETTINGS = StepSettings(
+    substeps=10, finest=1 / 1024, largest_turn=0.0125, follow_path=True, rounds=40
+)
 
 
 class QuasistaticTruth:

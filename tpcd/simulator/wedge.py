@@ -1,11 +1,12 @@
 """Rest poses between two rough terrains: what can slip is not held by a wedge.
 
-With mu >= 1 Coulomb's law allows both that an object in a corner slips and that it is held there,
-by forces between the terrains that nothing has pressed it with. The fixed point of `settle` starts
-without slip and may end in such a wedge, or creep into one. It is therefore sought from the other
-end too, the pose without friction, and that with less load is taken. So are answers for what is
-jammed, or did not converge, between two terrains. On steps in corners under friction 1.2 that is
-what MuJoCo does, and what terrains that yield by some micrometres do.
+Coulomb's law may allow both that an object in a corner slips and that it is held there, by forces
+between the terrains that nothing has pressed it with (on straight terrains at right angles with
+mu >= 1, and with less where the outline turns about its contacts). The fixed point of `settle`
+starts without slip and may end in such a wedge, or creep into one. It is therefore sought from the
+other end too, the pose without friction, and that with less load is taken. So are answers for what
+is jammed, or did not converge, between two terrains. On steps in corners that is what MuJoCo does
+when the arm moves slowly, and what terrains that yield by some micrometres do.
 """
 
 from __future__ import annotations
@@ -28,9 +29,6 @@ from tpcd.simulator.settle import (
     without_friction,
 )
 
-WEDGE = 0.8
-"""Product of the friction coefficients of two terrains from which on they may wedge an object: 1
-at right angles, 0.8 where one is tilted by 6 degrees."""
 PATIENCE = 3
 """Times as many rounds from the pose without friction."""
 LIGHTER = 0.999
@@ -51,8 +49,7 @@ def settle(
             return settled
         terrains = scene.friction.shape[-1]
         load = terrain_load(settled.contacts, terrains)
-        grip = torch.where(load > 0, scene.friction, 1.0).prod(-1)
-        between = ((load > 0).sum(-1) > 1) & (grip >= WEDGE)
+        between = (load > 0).sum(-1) > 1
         jammed = settled.status == int(StepStatus.RELAXED)
         index = torch.nonzero(between | jammed).flatten()
         if len(index) == 0:

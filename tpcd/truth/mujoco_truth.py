@@ -47,8 +47,10 @@ class MujocoSettings:
     inertia_time: float = 0.1
     """Square root of inertia over stiffness of every axis [s]."""
     ramp_time: float = 2.0
-    """Time in which the command moves from the last one to the next [s]; halving it moves
-    forces by 2 mN in the mean, doubling it by 1 mN."""
+    """Least time in which the command moves from the last one to the next [s]."""
+    ramp_speed: tuple[float, float] = (0.004, 0.01)
+    """Speed of the command at most [m/s, rad/s]: the arm lags by `damping_time` times its speed,
+    and friction sees another path. Large moves in 2 s end up to 3 mm elsewhere."""
     hold_time: float = 15.0
     """Longest time the command is held for the arm to settle [s]."""
     settled_force: float = 2e-4
@@ -153,7 +155,10 @@ def ramp_and_hold(
     `advance` integrates so many time steps of `data`, whose first three coordinates and
     controls are the arm's.
     """
-    ramp_steps = max(1, round(settings.ramp_time / settings.time_step))
+    way, turn = np.hypot(*(end - start)[:2]), abs(end[2] - start[2])
+    speed = settings.ramp_speed
+    ramp_time = max(settings.ramp_time, way / speed[0], turn / speed[1])
+    ramp_steps = max(1, round(ramp_time / settings.time_step))
     for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
         data.ctrl[:3] = start + fraction * (end - start)
         advance(1)

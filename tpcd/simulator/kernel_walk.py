@@ -1,0 +1,77 @@
+"""Compiled choices of how the path of a command is cut; the same as in `walk`.
+
+Contact modes are two bits for each terrain (see `ContactMode`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+from numba import njit
+
+from tpcd.simulator.walk import ALMOST
+
+
+@njit(_nrt=False)
+@no_type_check
+def ends_alike(before, now, terrains):
+    """Whether the end of a part does not depend on where on the way contact changed."""
+    if now == before or now == 0:
+        return True
+    loaded, loaded_before, slips = 0, 0, False
+    for t in range(terrains):
+        mode, mode_before = now >> 2 * t & 3, before >> 2 * t & 3
+        loaded += mode > 0
+        loaded_before += mode_before > 0
+        slips = slips or mode > 1 and mode_before > 0
+    return loaded == 1 and (loaded_before == 0 or loaded_before == 1 and slips)
+
+
+@njit(_nrt=False)
+@no_type_check
+def parts_of_path(request, turn, before, now, terrains):
+    """Into how many parts the path is cut, after it was gone at once."""
+    if request.substeps == 1:
+        return 1
+    parts = 1
+    if request.follow_path or not ends_alike(before, now, terrains):
+        parts = request.substeps
+    if now != 0 or before != 0:
+        parts = max(parts, math.ceil(abs(turn) / request.largest_turn - ALMOST))
+    return parts
+
+
+@njit(_nrt=False)
+@no_type_check
+def part_end(done, length, parts):
+    """Where the next part ends, as a share of the path."""
+    share = min(done + length, (math.floor(done * parts + ALMOST) + 1.0) / parts)
+    return share if share < 1.0 - ALMOST else 1.0
+
+
+@njit(_nrt=False)
+@no_type_check
+def sticking(mask, terrains):
+    """Contact modes of an object that rests on the terrains of a bit mask."""
+    modes = 0
+    for t in range(terrains):
+        modes |= (mask >> t & 1) << 2 * t
+    return modes
+
+
+@njit(_nrt=False)
+@no_type_check
+def contact_modes(space, terrains):
+    """Contact modes, two bits for each terrain, from the row that carries its largest load."""
+    modes = 0
+    for t in range(terrains):
+        mode, largest = 0, 0.0
+        for j in range(3):
+            load = space.multiplier[j]
+            if space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t and load > largest:
+                largest = load
+                slip = 2 if space.side[j] < 0.0 else 3
+                mode = slip if space.slipping[j] else 1
+        modes |= mode << 2 * t
+    return modes

@@ -21,11 +21,10 @@ from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import Scene, draw_scene, make_truth
 
 FREE, STICK, RIGHT, LEFT = 0, 1, 2, 3
-OFF = 1e-4
+OFF = 5e-5
 """A transition that ends so far from another answer ends elsewhere [m]."""
-STEPS = 20
-"""The wall is met after ten steps or more."""
-MOVED = ("milk_carton", "mug", "brick", "wine_glass", "toothpaste", "water_bottle")
+STEPS = 15
+MOVED = tuple(sorted(ENTRIES))[::3]
 
 
 @pytest.mark.parametrize(
@@ -111,8 +110,7 @@ def by_mujoco(scene: Scene, commands: torch.Tensor, settings: MujocoSettings) ->
 
 
 def test_large_moves_end_where_a_slow_arm_in_mujoco_comes_to_rest():
-    """Parts that are halved where contact changes are worth it, and so is a slow truth: of 120
-    transitions with them none ends elsewhere, else three do (also where the arm hurries)."""
+    """Parts that are halved where contact changes are worth it, and so is a slow truth."""
     pytest.importorskip("mujoco")
     usual, at_once = StepSettings(), StepSettings(finest=1.0, substeps=2, largest_turn=0.05)
     slow, fast = MujocoSettings(), MujocoSettings(ramp_speed=(math.inf, math.inf))
@@ -123,11 +121,11 @@ def test_large_moves_end_where_a_slow_arm_in_mujoco_comes_to_rest():
         off["at once"].append(off_from(truth, scene, commands, at_once))
         hurried = by_mujoco(scene, commands, fast)
         off["fast"].append(off_from(hurried, scene, commands, usual))
-    share = {what: float((torch.cat(each) > OFF).double().mean()) for what, each in off.items()}
-    print(share)
-    assert share["usual"] < 0.06
-    assert share["usual"] < 0.6 * share["at once"]
-    assert share["usual"] < 0.6 * share["fast"]
+    mean = {what: float(torch.cat(each).mean()) for what, each in off.items()}
+    print(mean)
+    assert mean["usual"] < 2e-5
+    assert mean["usual"] < 0.7 * mean["at once"]
+    assert mean["usual"] < 0.7 * mean["fast"]
 
 
 def test_a_truth_at_half_the_speed_is_the_same():

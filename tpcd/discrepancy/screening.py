@@ -20,7 +20,7 @@ from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.evidence import Fit, Question, carried, fit_stream
 from tpcd.effects.protocol import Effect
 
-PLACES = 8
+PLACES = 16
 """Places of the base fit from which points climb, for an effect of one parameter."""
 MOST_PLACES = 48
 ROUNDS = 4

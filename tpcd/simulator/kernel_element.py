@@ -29,7 +29,7 @@ from tpcd.simulator.kernel_walk import (
     parts_of_path,
     sticking,
 )
-from tpcd.simulator.walk import ALMOST
+from tpcd.simulator.walk import ALMOST, MOST_LOCATED
 from tpcd.simulator.wedge import LIGHTER
 
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
@@ -78,7 +78,7 @@ def step_element(
     # where contact changes or what is touched turns, and at once again if that went worse.
     rested, parts, straight = request.rested, 1, CONVERGED
     modes, status, residual, relaxed = 0, CONVERGED, 0.0, False
-    stage, done, length = (STRAIGHT if rested else RESTING), 0.0, 1.0
+    stage, done, length, located = (STRAIGHT if rested else RESTING), 0.0, 1.0, 0
     if rested:
         modes = sticking(touching(world, o, chains, pose), terrains)
         _keep(slopes, pose, kept_pose, height, entries)
@@ -120,6 +120,7 @@ def step_element(
             relaxed = attempt == FRICTIONLESS
             now = contact_modes(space, terrains)
         short = stage != WALKING or share - done <= request.finest * (1.0 + ALMOST)
+        short = short or located == MOST_LOCATED
         if not short and not ends_alike(modes, now, terrains):
             for a in range(3):
                 pose[a] = start[a]
@@ -163,8 +164,9 @@ def step_element(
             _restore(slopes, pose, kept_pose, height, entries)
             status, residual = CONVERGED, 0.0
         elif stage == WALKING and share < 1.0:
-            length = 1.0 / parts if ends_alike(modes, now, terrains) else request.finest
-            modes, done = now, share
+            if not ends_alike(modes, now, terrains) and located < MOST_LOCATED:
+                located += 1
+            modes, done, length = now, share, 1.0 / parts
         elif stage == WALKING and status > straight:
             stage, status, residual = STRAIGHT_AFTER_ALL, CONVERGED, 0.0
             _restore(slopes, pose, kept_pose, height, entries)

@@ -16,7 +16,7 @@ from tpcd.simulator.implicit import linear_response, loaded_frames, newton_pose
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus, Transition
 from tpcd.simulator.settle import Settled, own
-from tpcd.simulator.walk import ALMOST, ends_alike, part_end, parts_of_path
+from tpcd.simulator.walk import ALMOST, MOST_LOCATED, ends_alike, part_end, parts_of_path
 from tpcd.simulator.wedge import settle
 
 GRAZING = 1e-9
@@ -109,7 +109,7 @@ def _walk(
     """The end of the path in parts, for the elements that have more than one."""
     done = torch.where(parts > 1, 0.0, torch.ones_like(command[:, 0]))
     longest = 1.0 / parts.to(done)
-    length = longest.clone()
+    length, located = longest.clone(), torch.zeros_like(parts)
     while bool((done < 1).any()):
         index = torch.nonzero(done < 1).flatten()
         share = part_end(done[index], length[index], parts[index])
@@ -124,9 +124,10 @@ def _walk(
         )
         alike, gone = ends_alike(here.mode, there.mode), share - done[index]
         fits = alike | (gone <= settings.finest * (1 + ALMOST))
+        fits = fits | (located[index] == MOST_LOCATED)
+        located[index] += (fits & ~alike & (located[index] < MOST_LOCATED)).long()
         shorter = (0.5 * gone).clamp_min(settings.finest)
-        after = torch.where(alike, longest[index], settings.finest)
-        length[index] = torch.where(fits, after, shorter)
+        length[index] = torch.where(fits, longest[index], shorter)
         done[index] = torch.where(fits, share, done[index])
         state = state.put(index, there.where(fits, here))
     return state

@@ -56,10 +56,10 @@ class StepSettings:
     """Parts into which the command's path is cut where contact changes on the way, since friction
     then depends on the path. With 1, nothing is ever cut. Where the parts end worse than the whole
     step (see `StepStatus`), the whole one is the answer."""
-    finest: float = 1 / 64
+    finest: float = 1 / 32
     """Shortest part, as a share of the path: parts on which contact changes are halved down to it
     (see `walk`)."""
-    largest_turn: float = 0.025
+    largest_turn: float = 0.05
     """Most that the command turns in one part where anything is touched [rad]: what rolls or
     slips while it turns depends on the path too."""
     follow_path: bool = False

@@ -17,6 +17,8 @@ from tpcd.simulator.record import ContactMode, StepSettings
 
 ALMOST = 1e-9
 """Share of a part that is no part of its own."""
+MOST_LOCATED = 6
+"""Changes of contact that are located on one path; where it chatters, later ones are not."""
 
 
 def ends_alike(before: Int[Tensor, "b t"], now: Int[Tensor, "b t"]) -> Bool[Tensor, " b"]:

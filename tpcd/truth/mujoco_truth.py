@@ -48,6 +48,8 @@ class MujocoSettings:
     """Square root of inertia over stiffness of every axis [s]."""
     ramp_time: float = 2.0
     """Least time in which the command moves from the last one to the next [s]."""
+    longest_ramp: float = 100.0
+    """Longest such time [s], whatever the speed."""
     ramp_speed: tuple[float, float] = (0.004, 0.01)
     """Speed of the command at most [m/s, rad/s]: the arm lags by `damping_time` times its speed,
     and friction sees another path. Large moves in 2 s end up to 3 mm elsewhere."""
@@ -158,7 +160,7 @@ def ramp_and_hold(
     way, turn = np.hypot(*(end - start)[:2]), abs(end[2] - start[2])
     speed = settings.ramp_speed
     ramp_time = max(settings.ramp_time, way / speed[0], turn / speed[1])
-    ramp_steps = max(1, round(ramp_time / settings.time_step))
+    ramp_steps = max(1, round(min(ramp_time, settings.longest_ramp) / settings.time_step))
     for fraction in np.arange(1, ramp_steps + 1) / ramp_steps:
         data.ctrl[:3] = start + fraction * (end - start)
         advance(1)

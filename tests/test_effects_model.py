@@ -58,7 +58,7 @@ def test_the_example_of_the_docs_is_a_model(folder: Path) -> None:
     model = load_model(folder / "model.yaml")
     assert [effect.name for effect in model.effects] == ["wet_floor", "floor_compliance"]
     assert [(p.low, p.high) for p in model.effects[0].parameters] == [(-1.5, 1.5), (0.0, 0.1)]
-    assert model.step == StepSettings(substeps=4)
+    assert model.step == StepSettings(substeps=6)
     assert "beyond 50 mm" in model.effects[0].sentence(["-0.7", "50 mm"])
 
 

@@ -81,6 +81,9 @@ def test_settings_that_mean_nothing_are_refused():
         {"rounds": 0},
         {"compliance": -1.0},
         {"tolerance": 0.0},
+        {"largest_turn": 0.0},
+        {"finest": 1e-8},
+        {"finest": 1.5},
     ):
         with pytest.raises((ValueError, TypeError)):
             StepSettings(**wrong)

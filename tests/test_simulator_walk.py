@@ -95,6 +95,13 @@ def moved_scenes() -> list[tuple[Scene, torch.Tensor]]:
     return found
 
 
+def by_model(scene: Scene, commands: torch.Tensor) -> torch.Tensor:
+    """Poses at which the project's own truth comes to rest."""
+    truth = make_truth(scene, "quasistatic")
+    truth.reset(scene.start_pose)
+    return torch.stack([scene.start_pose, *(truth.step(command)[0] for command in commands[1:])])
+
+
 def by_mujoco(scene: Scene, commands: torch.Tensor, settings: MujocoSettings) -> torch.Tensor:
     """Poses at which MuJoCo comes to rest."""
     truth = MujocoTruth(
@@ -107,6 +114,39 @@ def by_mujoco(scene: Scene, commands: torch.Tensor, settings: MujocoSettings) ->
     )
     truth.reset(scene.start_pose)
     return torch.stack([scene.start_pose, *(truth.step(command)[0] for command in commands[1:])])
+
+
+def test_both_engines_walk_alike():
+    """Every answer, where parts are halved: modes, forces and derivatives too."""
+    pytest.importorskip("numba")
+    halved = 0
+    for scene, commands in moved_scenes()[3:7]:
+        truth = by_model(scene, commands)
+        model = make_scene(
+            scene.vertices_ee, scene.friction, scene.floor_height, scene.wall_position
+        )
+        asked = (model, truth[:-1], commands[1:], scene.stiffness)
+        found, other, coarse = (
+            simulate_step(*asked, settings, engine, previous=commands[:-1])
+            for settings, engine in (
+                (StepSettings(), "native"),
+                (StepSettings(), "torch"),
+                (StepSettings(finest=1.0), "native"),
+            )
+        )
+        assert torch.equal(found.mode, other.mode) and torch.equal(found.status, other.status)
+        # Between two terrains, forces answer ten thousandfold to where it has settled [N/m].
+        for name, near in (
+            ("pose", 1e-6),
+            ("contacts", 1e-3),
+            ("pose_from_start", 1e-3),
+            ("pose_from_gap", 1e-3),
+            ("pose_from_lever", 1e-3),
+        ):
+            ours, theirs = getattr(found, name), getattr(other, name)
+            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=near, msg=name)
+        halved += int(((found.pose - coarse.pose).abs().amax(-1) > 1e-6).sum())
+    assert halved >= 3
 
 
 def test_large_moves_end_where_a_slow_arm_in_mujoco_comes_to_rest():

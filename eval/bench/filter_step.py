@@ -107,7 +107,9 @@ def model_rows(
     for engine in ("torch",) if device.type == "cuda" else ("native", "torch"):
         for friction in ("anitescu", "coulomb"):
             for substeps in (1, 10):
-                settings = StepSettings(friction=friction, substeps=substeps, follow_path=True)
+                settings = StepSettings(
+                    friction=friction, substeps=substeps, finest=1.0, follow_path=True
+                )
                 if engine == "torch" and device.type == "cpu" and substeps > 1:
                     continue
                 found = _simulate(scene, work, settings, engine)

@@ -51,7 +51,7 @@ from tpcd.planar import wrap_angle
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
 
-PAPER_STEP = StepSettings(friction="anitescu")
+PAPER_STEP = StepSettings(friction="anitescu", substeps=2, finest=1.0)
 """The convex friction of the paper."""
 
 

@@ -27,7 +27,7 @@ from tpcd.shape.checkpoint import find_prior, load_prior
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _TENSORS = ("vectors", "weights", "misfit_sd", "misfit_mean", "misfit_covariance", "stiffness")
 
 

@@ -11,7 +11,7 @@ A YAML file:
       - name: magnet                     # an effect of your own
         file: my_effects.py              # relative to this file; holds EFFECTS = (...)
     step:                                # optional: settings of the step
-      substeps: 4
+      substeps: 6
 
 Reading a file with `file:` runs the Python code in it; docs/effects.md says how to write one.
 """

@@ -118,6 +118,9 @@ def step_element(
                     world.friction[o, t] = 0.0 if loose else space.friction[t]
                 attempt = following
             relaxed = attempt == FRICTIONLESS
+            if relaxed and ended == RELAXED:
+                status = JAMMED
+                break
             now = contact_modes(space, terrains)
         short = stage != WALKING or share - done <= request.finest * (1.0 + ALMOST)
         short = short or located == MOST_LOCATED
@@ -130,9 +133,6 @@ def step_element(
             length = max(0.5 * (share - done), request.finest)
             continue
         if relaxed:
-            if ended == RELAXED:
-                status = JAMMED
-                break
             ended = RELAXED
         if fraction == 1.0:
             for a in range(3):

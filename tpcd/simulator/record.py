@@ -17,6 +17,9 @@ from torch import Tensor
 MAX_LOADED = 3
 """Most contacts rows that can be active at once: the number of degrees of freedom."""
 
+LEAST_FINEST = 1e-6
+"""Shorter parts cannot be told from rounding."""
+
 
 class StepStatus(IntEnum):
     """How the quasi-static step of one element ended."""
@@ -57,8 +60,8 @@ class StepSettings:
     then depends on the path. With 1, nothing is ever cut. Where the parts end worse than the whole
     step (see `StepStatus`), the whole one is the answer."""
     finest: float = 1 / 32
-    """Shortest part, as a share of the path: parts on which contact changes are halved down to it
-    (see `walk`)."""
+    """Share of the path down to which parts on which contact changes are halved (see `walk`); with
+    1, none is."""
     largest_turn: float = 0.05
     """Most that the command turns in one part where anything is touched [rad]: what rolls or
     slips while it turns depends on the path too."""
@@ -79,8 +82,8 @@ class StepSettings:
             raise ValueError(
                 f"substeps {self.substeps} and rounds {self.rounds} must both be at least 1"
             )
-        if not 0 < self.finest <= 1:
-            raise ValueError(f"finest is {self.finest}, expected a share above 0 and up to 1")
+        if not LEAST_FINEST <= self.finest <= 1:
+            raise ValueError(f"finest is {self.finest}, expected a share of {LEAST_FINEST} to 1")
         if not self.largest_turn > 0:
             raise ValueError(f"largest_turn is {self.largest_turn}, expected radians above 0")
         if self.compliance < 0 or self.tolerance <= 0:

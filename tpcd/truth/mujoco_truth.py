@@ -49,9 +49,9 @@ class MujocoSettings:
     ramp_time: float = 2.0
     """Least time in which the command moves from the last one to the next [s]."""
     longest_ramp: float = 100.0
-    """Longest such time [s], whatever the speed."""
+    """Longest such time [s]: moves of more than 0.4 m or 1 rad are faster than `ramp_speed`."""
     ramp_speed: tuple[float, float] = (0.004, 0.01)
-    """Speed of the command at most [m/s, rad/s]: the arm lags by `damping_time` times its speed,
+    """Speed of the command [m/s, rad/s]: the arm lags by `damping_time` times its speed,
     and friction sees another path. Large moves in 2 s end up to 3 mm elsewhere."""
     hold_time: float = 15.0
     """Longest time the command is held for the arm to settle [s]."""

@@ -13,7 +13,7 @@ import torch
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.belief import Belief
-from tpcd.belief.storage import load_belief, save_belief
+from tpcd.belief.storage import FORMAT_VERSION, load_belief, save_belief
 from tpcd.errors import RunError
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
@@ -186,7 +186,8 @@ def test_a_folder_without_a_belief_is_refused_in_one_line(tmp_path: Path) -> Non
     with pytest.raises(RunError, match="no such file; give the folder that estimate wrote"):
         load_belief(tmp_path)
     (tmp_path / "belief.json").write_text('{"format": "tpcd-belief", "format_version": 99}')
-    with pytest.raises(RunError, match="version 99, expected tpcd-belief version 2"):
+    expected = f"version 99, expected tpcd-belief version {FORMAT_VERSION}"
+    with pytest.raises(RunError, match=expected):
         load_belief(tmp_path)
 
 

@@ -1,4 +1,5 @@
-"""How the command's path is cut: where contact changes on the way, and against slow arms."""
+"""How the command's path is cut: where contact changes on the way, derivatives of that, and against
+paths of many parts and slow arms."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import itertools
 import math
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +17,19 @@ from contact_scenes import make_scene
 
 from tpcd.shape.builtin import ENTRIES, make_entry
 from tpcd.simulator import StepSettings, simulate_step
-from tpcd.simulator.walk import ends_alike, part_end, parts_of_path
+from tpcd.simulator.walk import (
+    AIM,
+    GLANCE,
+    LOOK,
+    SHY,
+    TRY,
+    ends_alike,
+    least_part,
+    next_part,
+    part_end,
+    parts_of_path,
+    shorter_part,
+)
 from tpcd.truth.mujoco_truth import MujocoSettings, MujocoTruth
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import Scene, draw_scene, make_truth
@@ -25,6 +39,12 @@ OFF = 5e-5
 """A transition that ends so far from another answer ends elsewhere [m]."""
 STEPS = 15
 MOVED = tuple(sorted(ENTRIES))[::3]
+
+
+def compiled_walk():
+    """The compiled loops' choices; an error of their own is no reason to skip."""
+    pytest.importorskip("numba")
+    return import_module("tpcd.simulator.kernel_walk")
 
 
 @pytest.mark.parametrize(
@@ -49,7 +69,7 @@ def test_only_what_the_way_decides_is_cut(before, now, alike):
 
 @pytest.mark.parametrize("terrains", [1, 2, 3])
 def test_compiled_loops_cut_as_torch_does(terrains):
-    kernel = pytest.importorskip("tpcd.simulator.kernel_walk")
+    kernel = compiled_walk()
     modes = list(itertools.product(range(4), repeat=terrains))
     settings = StepSettings(substeps=3, largest_turn=0.1)
     request = SimpleNamespace(substeps=3, largest_turn=0.1, follow_path=False)
@@ -63,13 +83,43 @@ def test_compiled_loops_cut_as_torch_does(terrains):
 
 
 def test_parts_end_at_their_grid_and_at_the_command():
-    kernel = pytest.importorskip("tpcd.simulator.kernel_walk")
+    kernel = compiled_walk()
     done, length = torch.tensor([0.0, 0.25, 0.3, 0.5, 0.99]).double(), 0.25
     expected = [0.25, 0.5, 0.5, 0.75, 1.0]
     found = part_end(done, torch.full_like(done, length), torch.full((5,), 4))
     torch.testing.assert_close(found, torch.tensor(expected).double())
     for start, end in zip(done.tolist(), expected, strict=True):
         assert kernel.part_end(start, length, 4) == pytest.approx(end)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 1e-4, 0.03, 0.2, 0.9, math.inf])
+@pytest.mark.parametrize("length", [2e-3, 0.04, 0.25])
+def test_both_engines_take_the_same_parts(ahead, length):
+    kernel = compiled_walk()
+    finest = 1 / 32
+    far, gone = (torch.tensor([v], dtype=torch.float64) for v in (ahead, length))
+    flags = [torch.tensor([False]), torch.tensor([True])]
+    for passes, seeks in itertools.product(flags, flags):
+        kind, found = next_part(passes, seeks, far, gone)
+        expected = kernel.next_part(bool(passes), bool(seeks), ahead, length)
+        assert (int(kind), float(found)) == expected
+    for name, moving in itertools.product((TRY, LOOK, AIM), flags):
+        kind = torch.tensor([name])
+        assert float(least_part(kind, finest)) == kernel.least_part(name, finest)
+        after, found = shorter_part(kind, moving, far, gone, finest)
+        expected = kernel.shorter_part(name, bool(moving), ahead, length, finest)
+        assert (int(after), float(found)) == expected
+
+
+def test_an_expected_change_is_aimed_at_and_then_looked_at():
+    yes, no = torch.tensor([True]), torch.tensor([False])
+    ahead, left = torch.tensor([0.2]).double(), torch.tensor([0.5]).double()
+    assert next_part(no, yes, ahead, left) == (AIM, pytest.approx(SHY * 0.2))
+    assert next_part(yes, yes, ahead, left) == (LOOK, GLANCE)
+    assert next_part(no, no, ahead, left) == (TRY, 0.5)
+    assert next_part(no, yes, 3 * left, left) == (TRY, 0.5)
+    halved = shorter_part(torch.tensor([AIM]), yes, ahead, ahead, 1 / 32)
+    assert halved == (AIM, pytest.approx(0.1))
 
 
 def off_from(truth: torch.Tensor, scene: Scene, commands: torch.Tensor, settings: StepSettings):
@@ -149,10 +199,123 @@ def test_both_engines_walk_alike():
     assert halved >= 3
 
 
+def moved_transitions() -> list[tuple[Scene, torch.Tensor, torch.Tensor]]:
+    """Scenes, poses at rest and commands, of the project's own truth."""
+    return [(scene, by_model(scene, commands), commands) for scene, commands in moved_scenes()]
+
+
+def model_of(scene: Scene, floor: float = 0.0, wall: float = 0.0):
+    """The scene with its terrains moved [m]."""
+    return make_scene(
+        scene.vertices_ee,
+        scene.friction,
+        scene.floor_height + floor,
+        scene.wall_position + wall,
+    )
+
+
+def test_paths_end_where_those_of_many_parts_do():
+    """Changes of contact that are located stand for a path in 300 parts."""
+    pytest.importorskip("numba")
+    fine = StepSettings(substeps=300, finest=1.0, follow_path=True, rounds=40)
+    usual, at_once = StepSettings(), StepSettings(finest=1.0)
+    off = {usual: [], at_once: []}
+    for scene, truth, commands in moved_transitions():
+        asked = (model_of(scene), truth[:-1], commands[1:], scene.stiffness)
+        end = simulate_step(*asked, fine, previous=commands[:-1]).pose
+        for settings, found in off.items():
+            pose = simulate_step(*asked, settings, previous=commands[:-1]).pose
+            found.append((pose - end)[:, :2].abs().amax(-1))
+    share = {k: float((torch.cat(v) > OFF).double().mean()) for k, v in off.items()}
+    assert share[usual] < 0.03
+    assert share[usual] < 0.5 * share[at_once]
+
+
+def slopes_of(ends: list[torch.Tensor], size: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Central difference of poses after steps of `SIZES` times a size, and where it is smooth: what
+    goes over a kink is told by the two widths differing."""
+    wide, narrow = (ends[0] - ends[1]) / (2 * size), (ends[2] - ends[3]) / (0.6 * size)
+    return wide, (wide - narrow).abs() < 1e-2 * (1 + wide.abs().amax(-1, keepdim=True))
+
+
+SIZES = (1.0, -1.0, 0.3, -0.3)
+EXACT = StepSettings(tolerance=1e-12)
+
+
+def test_derivatives_know_that_the_place_of_a_change_moves():
+    """Central differences by start, floor and wall where changes of contact were located."""
+    pytest.importorskip("numba")
+    size, errors = 1e-6, []
+    for scene, truth, commands in moved_transitions():
+
+        def step(start, settings=EXACT, scene=scene, commands=commands, **moved):
+            asked = (model_of(scene, **moved), start, commands[1:], scene.stiffness)
+            return simulate_step(*asked, settings, "native", previous=commands[:-1])
+
+        here, start = step(truth[:-1]), truth[:-1]
+        cut = step(start, replace(EXACT, finest=1.0)).pose
+        located = (here.pose - cut).abs().amax(-1) > 1e-6
+        by_start, axes = here.pose_from_start.unbind(-1), torch.eye(3, dtype=torch.float64)
+        # A gap grows as the floor sinks, and as the wall at +x recedes.
+        for closed, ends in (
+            *(
+                (closed, [step(start + s * size * axis) for s in SIZES])
+                for closed, axis in zip(by_start, axes, strict=True)
+            ),
+            (here.pose_from_gap[:, 0], [step(start, floor=-s * size) for s in SIZES]),
+            (here.pose_from_gap[:, 1], [step(start, wall=s * size) for s in SIZES]),
+        ):
+            slope, smooth = slopes_of([end.pose for end in ends], size)
+            error = (slope - closed).abs().amax(-1) / (1 + slope.abs().amax(-1))
+            errors.append(error[located & smooth.all(-1)])
+    errors = torch.cat(errors)
+    assert len(errors) > 50
+    assert float((errors < 1e-2).double().mean()) > 0.97
+
+
+def test_autograd_knows_that_the_place_of_a_change_moves():
+    """Through the outline's points and friction, against central differences."""
+    pytest.importorskip("numba")
+    size, errors = 1e-6, []
+    for scene, truth, commands in moved_transitions()[6:10]:
+        asked = (model_of(scene), truth[:-1], commands[1:], scene.stiffness)
+        whole, cut = (
+            simulate_step(*asked, settings, previous=commands[:-1]).pose
+            for settings in (EXACT, replace(EXACT, finest=1.0))
+        )
+        located = torch.nonzero((whole - cut).abs().amax(-1) > 1e-6).flatten()
+        rows = (truth[located], commands[located + 1], commands[located])
+        zero = torch.zeros(len(located), dtype=torch.float64)
+
+        def step(larger, rougher, scene=scene, rows=rows, zero=zero):
+            points = scene.vertices_ee * (1 + larger[:, None, None])
+            floor, wall = zero + scene.floor_height, zero + scene.wall_position
+            model = make_scene(points, scene.friction * (1 + rougher), floor, wall)
+            start, command, before = rows
+            step = (start, command, scene.stiffness, EXACT)
+            return simulate_step(model, *step, previous=before).pose
+
+        larger, rougher = zero.clone().requires_grad_(), zero.clone().requires_grad_()
+        pose = step(larger, rougher)
+        ends = [
+            [step(zero + s * size, zero) for s in SIZES],
+            [step(zero, zero + s * size) for s in SIZES],
+        ]
+        for axis in range(3):
+            found = torch.autograd.grad(pose[:, axis].sum(), (larger, rougher), retain_graph=True)
+            for closed, each in zip(found, ends, strict=True):
+                slope, smooth = slopes_of(each, size)
+                error = (slope[:, axis] - closed).abs() / (0.02 + slope[:, axis].abs())
+                errors.append(error[smooth.all(-1)])
+    errors = torch.cat(errors)
+    assert len(errors) > 40
+    assert float((errors < 2e-2).double().mean()) > 0.95
+
+
 def test_large_moves_end_where_a_slow_arm_in_mujoco_comes_to_rest():
-    """Parts that are halved where contact changes are worth it, and so is a slow truth."""
+    """Guards what was measured: locating changes is worth it, and so is a slow truth."""
     pytest.importorskip("mujoco")
-    usual, at_once = StepSettings(), StepSettings(finest=1.0, substeps=2, largest_turn=0.05)
+    usual, at_once = StepSettings(), StepSettings(finest=1.0)
     slow, fast = MujocoSettings(), MujocoSettings(ramp_speed=(math.inf, math.inf))
     off = {what: [] for what in ("usual", "at once", "fast")}
     for scene, commands in moved_scenes():
@@ -162,7 +325,6 @@ def test_large_moves_end_where_a_slow_arm_in_mujoco_comes_to_rest():
         hurried = by_mujoco(scene, commands, fast)
         off["fast"].append(off_from(hurried, scene, commands, usual))
     mean = {what: float(torch.cat(each).mean()) for what, each in off.items()}
-    print(mean)
     assert mean["usual"] < 2e-5
     assert mean["usual"] < 0.7 * mean["at once"]
     assert mean["usual"] < 0.7 * mean["fast"]

@@ -29,12 +29,17 @@ SINGULAR = 1e-12
 
 @dataclass(frozen=True)
 class LinearResponse:
-    """First-order change of the settled pose with start, command, gap and lever of each terrain."""
+    """First-order change of the settled pose with start, command, gap and lever of each terrain,
+    and that of the multipliers of the three rows in the same order."""
 
     start: Float[Tensor, "b 3 3"]
     command: Float[Tensor, "b 3 3"]
     gap: Float[Tensor, "b t 3"]
     lever: Float[Tensor, "b t 3"]
+    load_start: Float[Tensor, "b 3 3"]
+    load_command: Float[Tensor, "b 3 3"]
+    load_gap: Float[Tensor, "b t 3"]
+    load_lever: Float[Tensor, "b t 3"]
 
 
 @dataclass(frozen=True)
@@ -92,26 +97,29 @@ def linear_response(
     with torch.no_grad():
         system = _system(scene, start, command, stiffness, pose, contacts, settings)
         zero_force = torch.zeros_like(system.force_residual)
-        columns = []
+        zero_row = torch.zeros_like(system.row_residual)
+        start, command, gap, lever = [], [], [], []
         for axis in range(3):
-            columns.append(_solve(system, zero_force, -system.start_row[..., axis])[0])
-        for axis in range(3):
+            start.append(_solve(system, zero_force, -system.start_row[..., axis]))
             push = torch.zeros_like(zero_force)
             push[:, axis] = stiffness[..., axis]
-            columns.append(_solve(system, push, torch.zeros_like(system.row_residual))[0])
-        gap, lever = [], []
+            command.append(_solve(system, push, zero_row))
         for t in range(len(scene.terrains)):
             here = ((contacts.terrain == t) & system.loaded).to(pose.dtype)
-            gap.append(_solve(system, zero_force, -here)[0])
+            gap.append(_solve(system, zero_force, -here))
             moment = torch.zeros_like(zero_force)
             moment[:, 2] = (here * contacts.multiplier).sum(-1)
-            lever.append(_solve(system, moment, torch.zeros_like(here))[0])
-        return LinearResponse(
-            start=torch.stack(columns[:3], dim=-1),
-            command=torch.stack(columns[3:], dim=-1),
-            gap=torch.stack(gap, dim=-2),
-            lever=torch.stack(lever, dim=-2),
-        )
+            lever.append(_solve(system, moment, zero_row))
+        named = {}
+        for name, columns, axis in (
+            ("start", start, -1),
+            ("command", command, -1),
+            ("gap", gap, -2),
+            ("lever", lever, -2),
+        ):
+            named[name] = torch.stack([motion for motion, _ in columns], dim=axis)
+            named[f"load_{name}"] = torch.stack([load for _, load in columns], dim=axis)
+        return LinearResponse(**named)
 
 
 def _system(

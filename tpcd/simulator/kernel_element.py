@@ -11,6 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from tpcd.simulator.kernel_events import NOTHING, next_event, respond_until
 from tpcd.simulator.kernel_geometry import first_touch, touching
 from tpcd.simulator.kernel_linear import linear_system
 from tpcd.simulator.kernel_request import sound, wrap
@@ -25,11 +26,22 @@ from tpcd.simulator.kernel_slopes import (
 from tpcd.simulator.kernel_walk import (
     contact_modes,
     ends_alike,
+    least_part,
+    next_part,
     part_end,
     parts_of_path,
+    shorter_part,
     sticking,
 )
-from tpcd.simulator.walk import ALMOST, MOST_LOCATED
+from tpcd.simulator.walk import (
+    AIM,
+    ALMOST,
+    GLANCE,
+    LOOK,
+    MOST_SOUGHT,
+    PASSED,
+    TRY,
+)
 from tpcd.simulator.wedge import LIGHTER
 
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
@@ -78,7 +90,8 @@ def step_element(
     # where contact changes or what is touched turns, and at once again if that went worse.
     rested, parts, straight = request.rested, 1, CONVERGED
     modes, status, residual, relaxed = 0, CONVERGED, 0.0, False
-    stage, done, length, located = (STRAIGHT if rested else RESTING), 0.0, 1.0, 0
+    stage, done, length, spent = (STRAIGHT if rested else RESTING), 0.0, 1.0, 0
+    kind, seeks, moving, ahead = TRY, False, False, np.inf
     if rested:
         modes = sticking(touching(world, o, chains, pose), terrains)
         _keep(slopes, pose, kept_pose, height, entries)
@@ -122,16 +135,22 @@ def step_element(
                 status = JAMMED
                 break
             now = contact_modes(space, terrains)
-        short = stage != WALKING or share - done <= request.finest * (1.0 + ALMOST)
-        short = short or located == MOST_LOCATED
-        if not short and not ends_alike(modes, now, terrains):
+        gone = share - done
+        idle = stage != WALKING or request.finest == 1.0 or spent == MOST_SOUGHT
+        fits = idle or gone <= least_part(kind, request.finest) * (1.0 + ALMOST)
+        fits = fits or ends_alike(modes, now, terrains)
+        if not idle and (kind == AIM or not fits):
+            spent += 1
+        seeks = (seeks or not fits) and spent < MOST_SOUGHT
+        if not fits:
             for a in range(3):
                 pose[a] = start[a]
             if relaxed:
                 for t in range(terrains):
                     world.friction[o, t] = space.friction[t]
-            length = max(0.5 * (share - done), request.finest)
+            kind, length = shorter_part(kind, moving, ahead, gone, request.finest)
             continue
+        ahead, event = np.inf, NOTHING
         if relaxed:
             ended = RELAXED
         if fraction == 1.0:
@@ -146,10 +165,22 @@ def step_element(
             turn = (math.cos(pose[2]), math.sin(pose[2]))
             linear_system(world, o, law, part, pose, turn, space)
             settling_response(law, terrains, space, slopes)
+            if stage == WALKING and share < 1.0:
+                ahead, event = next_event(
+                    world, o, chains, law, before, command, pose, space, slopes.rate
+                )
+                room = min(PASSED * gone, part_end(done, 1.0 / parts, parts) - share)
+                if kind == AIM and ahead < room:
+                    respond_until(world, o, law, event, pose, space, slopes)
+                else:
+                    event = NOTHING
             append_part(slopes, follows, space.force, space.right)
-            append_theta(
-                world, o, law, by_theta, moved, (point, terrain), landing, pose, space, slopes
-            )
+            touch = (point, terrain)
+            append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, space, slopes)
+            if event[0] >= 0:
+                share += ahead
+                for a in range(3):
+                    pose[a] += ahead * slopes.rate[a]
             if relaxed:
                 for t in range(terrains):
                     world.friction[o, t] = space.friction[t]
@@ -161,12 +192,16 @@ def step_element(
             if parts == 1:
                 break
             stage, straight, length = WALKING, status, 1.0 / parts
+            if request.finest < 1.0 and not ends_alike(modes, now, terrains):
+                seeks, kind, length = True, LOOK, GLANCE
             _restore(slopes, pose, kept_pose, height, entries)
             status, residual = CONVERGED, 0.0
         elif stage == WALKING and share < 1.0:
-            if not ends_alike(modes, now, terrains) and located < MOST_LOCATED:
-                located += 1
-            modes, done, length = now, share, 1.0 / parts
+            modes, done, moving = now, share, True
+            if event[0] >= 0:
+                ahead = 0.0
+            longest = part_end(done, 1.0 / parts, parts) - done
+            kind, length = next_part(event[0] >= 0, seeks, ahead, longest)
         elif stage == WALKING and status > straight:
             stage, status, residual = STRAIGHT_AFTER_ALL, CONVERGED, 0.0
             _restore(slopes, pose, kept_pose, height, entries)

@@ -13,6 +13,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
+from tpcd.simulator.kernel_events import touch_row
 from tpcd.simulator.kernel_geometry import object_normal
 from tpcd.simulator.kernel_linear import respond
 
@@ -27,7 +28,8 @@ class Slopes(NamedTuple):
     `kept` a copy of it; `land` (6, 3) of the first touch by start and command, `land_gap`
     (t, 3) by gaps; `response` (6, 3) of one settling by start and command, `by_terrain`
     (2 t, 3) rows by gaps and by levers, `follow` and `yields` (3, 3) to get them with.
-    `theta` (d, 3) of the step so far by each entry of theta, `theta_kept` a copy of it.
+    `theta` (d, 3) of the step so far by each entry of theta, `theta_kept` a copy of it. `rate` (3)
+    of the pose with the share of the path.
     """
 
     whole: np.ndarray
@@ -40,6 +42,7 @@ class Slopes(NamedTuple):
     yields: np.ndarray
     theta: np.ndarray
     theta_kept: np.ndarray
+    rate: np.ndarray
 
 
 class SceneSlopes(NamedTuple):
@@ -67,6 +70,7 @@ def new_slopes(terrains, entries):
         np.zeros((3, 3)),
         np.zeros((entries, 3)),
         np.zeros((entries, 3)),
+        np.zeros(3),
     )
 
 
@@ -174,12 +178,12 @@ def append_part(slopes, follows, column, middle):
 
 @njit(_nrt=False)
 @no_type_check
-def append_theta(world, o, law, by_theta, moved, touch, landing, pose, space, slopes):
+def append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, space, slopes):
     """Append one settling to the derivatives of the whole step by theta.
 
     `moved` is the element of `by_theta`, `touch` (point, terrain) of the first touch in the pose
-    `landing`. At a given pose, an
-    entry of theta leaves a force on the balance and right-hand sides of the rows.
+    `landing`, `event` (see `kernel_events`) what the settled pose is passed on to. At a given pose,
+    an entry of theta leaves a force on the balance and right-hand sides of the rows.
     """
     point, terrain = touch
     land, response, theta = slopes.land, slopes.response, slopes.theta
@@ -210,6 +214,7 @@ def append_theta(world, o, law, by_theta, moved, touch, landing, pose, space, sl
             space.force[1] -= load * more * nx
             space.force[2] += load * (along - slope * height - more * (u * at_x + v * at_z))
         respond(space)
+        _pass_theta(world, o, by_theta, moved, e, event, pose, space, slopes.rate)
         u, v = object_normal(world, o, terrain, start_turn[0], start_turn[1])
         gap = u * by_theta.points[moved, e, 0, point] + v * by_theta.points[moved, e, 1, point]
         gap -= by_theta.offsets[moved, e, terrain]
@@ -224,6 +229,27 @@ def append_theta(world, o, law, by_theta, moved, touch, landing, pose, space, sl
             for k in range(3):
                 value += response[a, k] * space.right[k]
             theta[e, a] = value
+
+
+@njit(_nrt=False)
+@no_type_check
+def _pass_theta(world, o, by_theta, moved, e, event, pose, space, rate):
+    """Let the change of the pose with an entry of theta be that at an event, which moves too."""
+    which, point, inverse = event
+    if which < 0:
+        return
+    if which < 3:
+        later = space.gain[which]
+    else:
+        row, t = space.right, which - 3
+        touch_row(world, o, t, point, pose, row)
+        u, v = object_normal(world, o, t, math.cos(pose[2]), math.sin(pose[2]))
+        later = u * by_theta.points[moved, e, 0, point] + v * by_theta.points[moved, e, 1, point]
+        later -= by_theta.offsets[moved, e, t]
+        for a in range(3):
+            later += row[a] * space.change[a]
+    for a in range(3):
+        space.change[a] += rate[a] * inverse * later
 
 
 @njit(_nrt=False)

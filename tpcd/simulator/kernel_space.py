@@ -59,6 +59,7 @@ class Space(NamedTuple):
     right: np.ndarray
     change: np.ndarray
     gain: np.ndarray
+    margins: np.ndarray
     friction: np.ndarray
 
 
@@ -87,6 +88,7 @@ def new_space(terrains):
         np.zeros(3),
         np.zeros(3),
         np.zeros(3, np.bool_),
+        np.empty(3),
         np.empty(3),
         np.empty(3),
         np.empty(3),

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from typing import no_type_check
 
+import numpy as np
 from numba import njit
 
-from tpcd.simulator.walk import ALMOST
+from tpcd.simulator.walk import AIM, ALMOST, GLANCE, LOOK, SHY, TRY
 
 
 @njit(_nrt=False)
@@ -48,6 +49,39 @@ def part_end(done, length, parts):
     """Where the next part ends, as a share of the path."""
     share = min(done + length, (math.floor(done * parts + ALMOST) + 1.0) / parts)
     return share if share < 1.0 - ALMOST else 1.0
+
+
+@njit(_nrt=False)
+@no_type_check
+def least_part(kind, finest):
+    """Parts of a kind that are not shortened any more."""
+    if kind == LOOK:
+        return np.inf
+    return finest if kind == TRY else GLANCE
+
+
+@njit(_nrt=False)
+@no_type_check
+def next_part(passes, seeks, ahead, left):
+    """Kind and length of the part after one that was right."""
+    if passes:
+        return LOOK, GLANCE
+    if seeks and SHY * ahead < left:
+        return AIM, max(SHY * ahead, GLANCE)
+    return TRY, left
+
+
+@njit(_nrt=False)
+@no_type_check
+def shorter_part(kind, moving, ahead, gone, finest):
+    """Kind and length of the part in place of one of length `gone` on which contact changed."""
+    if not moving:
+        return LOOK, GLANCE
+    if kind == TRY and SHY * ahead < gone:
+        return AIM, max(SHY * ahead, GLANCE)
+    if kind == AIM:
+        return AIM, max(0.5 * gone, GLANCE)
+    return TRY, max(0.5 * gone, finest)
 
 
 @njit(_nrt=False)

@@ -55,13 +55,13 @@ class StepSettings:
     friction: Literal["coulomb", "anitescu"] = "coulomb"
     """`anitescu` is the convex relaxation (a sliding body is lifted by friction x slip);
     `coulomb` removes the lift by the fixed point of De Saxce and Feng (1998)."""
-    substeps: int = 4
-    """Parts into which the command's path is cut where contact changes on the way, since friction
-    then depends on the path. With 1, nothing is ever cut. Where the parts end worse than the whole
-    step (see `StepStatus`), the whole one is the answer."""
+    substeps: int = 2
+    """Parts into which the command's path is cut at least where contact changes on the way, since
+    friction then depends on the path. With 1, nothing is ever cut. Where the parts end worse than
+    the whole step (see `StepStatus`), the whole one is the answer."""
     finest: float = 1 / 32
-    """Share of the path down to which parts on which contact changes are halved (see `walk`); with
-    1, none is."""
+    """Changes of contact are located where a load or a gap is expected to come to zero; where none
+    is, parts are halved down to this share of the path (see `walk`). With 1, none is located."""
     largest_turn: float = 0.05
     """Most that the command turns in one part where anything is touched [rad]: what rolls or
     slips while it turns depends on the path too."""

@@ -4,7 +4,11 @@ One settling of a part answers for its end alone, which is right as long as cont
 the way, and also where a single contact begins to slip or is lost: then the end does not depend on
 where that happened. Where a contact that slipped comes to stick, it does, since it sticks to the
 place where it stopped; and where floor and wall are touched, what one does depends on when the
-other let go. Such parts are halved, down to a shortest one.
+other let go. Changes of contact on such a path are located. `LOOK` goes just far enough to see what
+contact does in this direction, `AIM` goes nearly to where the first load or gap then comes to zero
+at its rate (see `events`) and passes on to it, and `LOOK` sees what contact does beyond. Where none
+is foreseen, `TRY` goes on as far as the path is straight. What no load foretells, as that a turning
+object slips back, is closed in on by halving.
 """
 
 from __future__ import annotations
@@ -15,10 +19,21 @@ from torch import Tensor
 
 from tpcd.simulator.record import ContactMode, StepSettings
 
+TRY, LOOK, AIM = 0, 1, 2
+"""Kinds of parts, as in the file's opening."""
+GLANCE = 1 / 1024
+"""Share of the path that `LOOK` goes."""
+SHY = 0.995
+"""Share of the way to an expected change of contact that is settled; the rest is passed at the rate
+found there."""
+PASSED = 0.02
+"""Most that is passed so, as a share of what was settled. How the rate moves is left out of the
+derivatives, so that this bounds their error."""
 ALMOST = 1e-9
 """Share of a part that is no part of its own."""
-MOST_LOCATED = 6
-"""Changes of contact that are located on one path; where it chatters, later ones are not."""
+MOST_SOUGHT = 16
+"""Parts of a path that aim at a change of contact or are shortened; where it chatters, the rest is
+taken as it is."""
 
 
 def ends_alike(before: Int[Tensor, "b t"], now: Int[Tensor, "b t"]) -> Bool[Tensor, " b"]:
@@ -52,3 +67,45 @@ def part_end(
     """Where the next part ends, as a share of the path."""
     share = torch.minimum(done + length, ((done * parts + ALMOST).floor() + 1) / parts)
     return torch.where(share < 1 - ALMOST, share, 1.0)
+
+
+def least_part(kind: Int[Tensor, " b"], finest: float) -> Float[Tensor, " b"]:
+    """Parts of a kind that are not shortened any more, as a share of the path."""
+    found = torch.where(kind == TRY, finest, GLANCE)
+    return torch.where(kind == LOOK, torch.inf, found).double()
+
+
+def next_part(
+    passes: Bool[Tensor, " b"],
+    seeks: Bool[Tensor, " b"],
+    ahead: Float[Tensor, " b"],
+    left: Float[Tensor, " b"],
+) -> tuple[Int[Tensor, " b"], Float[Tensor, " b"]]:
+    """Kind and length of the part after one that was right.
+
+    `passes` tells whether that one passed on to a change of contact, `seeks` whether changes are to
+    be located, `ahead` where the next one is and `left` how far the path is straight.
+    """
+    aims = seeks & (SHY * ahead < left)
+    kind = torch.where(passes, LOOK, torch.where(aims, AIM, TRY))
+    length = torch.where(aims, (SHY * ahead).clamp_min(GLANCE), left)
+    return kind, torch.where(passes, GLANCE, length)
+
+
+def shorter_part(
+    kind: Int[Tensor, " b"],
+    moving: Bool[Tensor, " b"],
+    ahead: Float[Tensor, " b"],
+    gone: Float[Tensor, " b"],
+    finest: float,
+) -> tuple[Int[Tensor, " b"], Float[Tensor, " b"]]:
+    """Kind and length of the part in place of one of length `gone` on which contact changed.
+
+    `moving` tells whether contact is known for this direction, `ahead` where it changes next.
+    """
+    expected = (kind == TRY) & (SHY * ahead < gone)
+    aims = (kind == AIM) | expected
+    length = torch.where(expected, SHY * ahead, 0.5 * gone)
+    length = length.maximum(torch.where(aims, GLANCE, finest))
+    after = torch.where(moving, torch.where(aims, AIM, TRY), LOOK)
+    return after, torch.where(moving, length, GLANCE)

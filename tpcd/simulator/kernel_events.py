@@ -1,0 +1,106 @@
+"""Compiled search for where contact changes next on a path, and passing on to there, as in
+`events`.
+
+An event is (which, point, inverse): row 0-2 whose load comes to zero, or 3 + t where the point
+touches terrain t, and minus the inverse of the rate at which that load or gap falls.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from tpcd.simulator.events import SLOWEST
+from tpcd.simulator.kernel_geometry import lowest_point, object_normal
+from tpcd.simulator.kernel_linear import respond
+
+NOTHING = (-1, 0, 0.0)
+"""No event."""
+
+
+@njit(error_model="numpy", _nrt=False)
+@no_type_check
+def next_event(world, o, chains, law, before, command, pose, space, rate):
+    """Share of the path from `before` to `command` until contact changes, and the event.
+
+    `linear_system` must be filled for the pose. Leaves the pose's rate of change in `rate`.
+    """
+    margins = space.margins
+    for a in range(3):
+        space.force[a], space.right[a] = -space.system[7, a], -space.system[8, a]
+    respond(space)
+    for a in range(3):
+        margins[a] = space.multiplier[a] + space.gain[a]
+        space.force[a], space.right[a] = law.stiffness[a] * (command[a] - before[a]), 0.0
+    respond(space)
+    for a in range(3):
+        rate[a] = space.change[a]
+    ahead, which, point, inverse = np.inf, -1, 0, 0.0
+    for j in range(3):
+        margin, slope = max(margins[j], 0.0), space.gain[j]
+        if space.chosen[j, 0] >= 0 and slope < -SLOWEST * margin and margin < -slope * ahead:
+            ahead, which, inverse = -margin / slope, j, -1.0 / slope
+    turn = (math.cos(pose[2]), math.sin(pose[2]))
+    for t in range(world.normals.shape[1]):
+        touched = False
+        for j in range(3):
+            touched = touched or space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t
+        if touched:
+            continue
+        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        low, lowest = lowest_point(world, o, chains, t, u, v)
+        margin = max(low + nx * pose[0] + nz * pose[1] - world.offsets[o, t], 0.0)
+        across = v * world.points[o, 0, lowest] - u * world.points[o, 1, lowest]
+        slope = nx * rate[0] + nz * rate[1] + across * rate[2]
+        if slope < -SLOWEST * margin and margin < -slope * ahead:
+            ahead, which, point, inverse = -margin / slope, 3 + t, lowest, -1.0 / slope
+    return ahead, (which, point, inverse)
+
+
+@njit(_nrt=False)
+@no_type_check
+def respond_until(world, o, law, event, pose, space, slopes):
+    """Turn the response of a settling into that of the pose at the event."""
+    which, point, inverse = event
+    response, by_terrain, system = slopes.response, slopes.by_terrain, space.system
+    terrains, row = slopes.land_gap.shape[0], space.right
+    if which >= 3:
+        touch_row(world, o, which - 3, point, pose, row)
+    for c in range(3):
+        by_start, by_command = 0.0, 0.0
+        for i in range(3):
+            if which >= 3:
+                by_start += row[i] * response[i, c]
+                by_command += row[i] * response[3 + i, c]
+            else:
+                by_start -= system[9 + which, i] * system[12 + i, c]
+                by_command -= system[9 + which, i] * system[i, c] * system[6, c] * law.stiffness[c]
+        for a in range(3):
+            response[a, c] += slopes.rate[a] * inverse * by_start
+            response[3 + a, c] += slopes.rate[a] * inverse * by_command
+    for t in range(terrains):
+        by_gap, by_lever = 1.0 if t == which - 3 else 0.0, 0.0
+        for i in range(3):
+            if which >= 3:
+                by_gap += row[i] * by_terrain[t, i]
+                by_lever += row[i] * by_terrain[terrains + t, i]
+            else:
+                if space.chosen[i, 0] >= 0 and space.chosen[i, 1] == t:
+                    by_gap -= system[9 + which, i]
+                by_lever -= system[9 + which, i] * system[i, 2] * system[6, 2] * space.load[t]
+        for a in range(3):
+            by_terrain[t, a] += slopes.rate[a] * inverse * by_gap
+            by_terrain[terrains + t, a] += slopes.rate[a] * inverse * by_lever
+
+
+@njit(_nrt=False)
+@no_type_check
+def touch_row(world, o, t, point, pose, row):
+    """How the gap of a point to terrain t moves with the pose."""
+    u, v = object_normal(world, o, t, math.cos(pose[2]), math.sin(pose[2]))
+    row[0], row[1] = world.normals[o, t, 0], world.normals[o, t, 1]
+    row[2] = v * world.points[o, 0, point] - u * world.points[o, 1, point]

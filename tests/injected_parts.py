@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from tpcd.truth.injected import InjectedMujocoTruth
+from tpcd.truth.mujoco_truth import MujocoSettings
 from tpcd.truth.scene import Scene
 
 FORCE = 5e-3
@@ -38,9 +39,10 @@ def make_scene(vertices=SLAB, friction=NOMINAL, floor=0.0, wall=0.5, start=(0.0,
     return Scene("s", vertices, 1.0, mount, friction, floor, wall, vector(*start), stiffness)
 
 
-def follow(hidden, *commands, steps=None, **scene) -> np.ndarray:
+def follow(hidden, *commands, steps=None, settings=None, **scene) -> np.ndarray:
     """Rows (n, 6) of pose and wrench; every step settles and agrees with the contact forces."""
-    truth = InjectedMujocoTruth(make_scene(**scene), hidden, steps or len(commands))
+    settings = settings or MujocoSettings()
+    truth = InjectedMujocoTruth(make_scene(**scene), hidden, steps or len(commands), settings)
     rows = []
     for command in commands:
         pose, wrench, settled = truth.step(vector(*command))

@@ -2,7 +2,9 @@
 
 As long as contact stays as it is, the loads of its rows and the gaps of the other terrains change
 in proportion to the path, to first order. Contact changes where the first of them comes to zero:
-a contact is lost, comes to the edge of its friction cone, or another terrain is touched.
+a contact is lost, comes to the edge of its friction cone, or another terrain is touched. Locating
+such changes and starting anew there is the event-driven scheme for nonsmooth systems (Acary and
+Brogliato, "Numerical Methods for Nonsmooth Dynamical Systems", 2008).
 """
 
 from __future__ import annotations
@@ -19,14 +21,14 @@ from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import ContactSet
 
 SLOWEST = 1e-3
-"""Share of a load, or of an extent of one metre in a gap, that must be lost on a whole path for its
-end to be foreseen."""
+"""Share of a load or gap that must be lost on a whole path for its end to be foreseen."""
 
 
 @dataclass(frozen=True)
 class Event:
     """The next change of contact: share of the path until then, infinite if none is foreseen, the
-    pose's rate of change with the share, and the derivatives of `ahead` by what settled the pose.
+    pose's `rate` of change with the share [m, m, rad], and the derivatives of `ahead` by start and
+    command of the settling [1/m, 1/m, 1/rad] and by gap and lever of each terrain [1/m].
     """
 
     ahead: Float[Tensor, " b"]
@@ -47,7 +49,8 @@ def next_event(
 ) -> Event:
     """Where contact changes next, at a settled pose on a path whose command moves by `way`.
 
-    `multiplier` and `pose` may carry derivatives, which `ahead` then has too.
+    `way` is [m, m, rad], `multiplier` [N]; `multiplier` and `pose` may carry derivatives, which
+    `ahead` then has too.
     """
     rate = (response.command @ way[..., None])[..., 0]
     lost = (response.load_command @ way[..., None])[..., 0]

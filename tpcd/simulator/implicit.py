@@ -56,19 +56,6 @@ class _System:
     start_row: Tensor
 
 
-def newton_pose(
-    scene: ContactScene,
-    start: Float[Tensor, "b 3"],
-    command: Float[Tensor, "b 3"],
-    stiffness: Float[Tensor, "*each 3"],
-    pose: Float[Tensor, "b 3"],
-    contacts: ContactSet,
-    settings: StepSettings,
-) -> Float[Tensor, "b 3"]:
-    """The settled pose again, now carrying derivatives."""
-    return newton_step(scene, start, command, stiffness, pose, contacts, settings)[0]
-
-
 def newton_step(
     scene: ContactScene,
     start: Float[Tensor, "b 3"],

@@ -23,13 +23,15 @@ GRAZING = 1e-9
 
 @dataclass(frozen=True)
 class State:
-    """Where the object is after part of a step, with derivatives by the start of the step."""
+    """Where the object is after part of a step (pose (b, 3) [m, m, rad]), with its derivatives by
+    the start of the step (b, 3, 3) and by gap [m] and lever [m] of each terrain (b, t, 3)."""
 
     pose: Tensor
     from_start: Tensor
     from_gap: Tensor
     from_lever: Tensor
     contacts: Tensor
+    """Normal and tangential force [N] and arm of the contact point [m, m] of each terrain."""
     mode: Tensor
     status: Tensor
     residual: Tensor
@@ -56,7 +58,7 @@ class State:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a path from `path_start` to `command`, up to a share of it.
+    """A part of a path from `path_start` to `command` (b, 3) [m, m, rad], up to a `share` (b).
 
     `rested` says that the path begins at the start pose, so that it moves with it. Where the next
     event lies within `room` (share of the path), the part passes on to it.
@@ -95,7 +97,7 @@ def start_state(scene: ContactScene, start: Tensor) -> State:
     """The object at rest where it is, before anything was settled."""
     count, terrains = scene.friction.shape
     zeros = start.new_zeros(count, terrains, 3)
-    whole = torch.zeros(count, dtype=torch.long, device=start.device)
+    none = torch.zeros(count, dtype=torch.long, device=start.device)
     return State(
         pose=start,
         from_start=torch.eye(3).to(start).expand(count, 3, 3),
@@ -103,10 +105,10 @@ def start_state(scene: ContactScene, start: Tensor) -> State:
         from_lever=zeros,
         contacts=start.new_zeros(count, terrains, 4),
         mode=torch.zeros(count, terrains, dtype=torch.long, device=start.device),
-        status=whole,
+        status=none,
         residual=start.new_zeros(count),
         ahead=start.new_full((count,), torch.inf),
-        passes=whole > 0,
+        passes=none > 0,
         passed=start.new_zeros(count),
     )
 

@@ -97,8 +97,8 @@ def _walk(
     changes of contact are located from the start."""
     done = torch.where(parts > 1, 0.0, torch.ones_like(command[:, 0]))
     longest = 1.0 / parts.to(done)
-    length, spent = longest.clone(), torch.zeros_like(parts)
-    moving, seeks = torch.zeros_like(seeks), seeks & (settings.finest < 1)
+    spent, moving = torch.zeros_like(parts), torch.zeros_like(seeks)
+    seeks = seeks & (settings.finest < 1)
     kinds = torch.where(seeks, LOOK, TRY)
     length = torch.where(seeks, GLANCE, longest)
     while bool((done < 1).any()):

@@ -28,7 +28,7 @@ SHY = 0.995
 found there."""
 PASSED = 0.02
 """Most that is passed so, as a share of what was settled. How the rate moves is left out of the
-derivatives, so that this bounds their error."""
+derivatives, whose error this keeps small."""
 ALMOST = 1e-9
 """Share of a part that is no part of its own."""
 MOST_SOUGHT = 16
@@ -71,8 +71,8 @@ def part_end(
 
 def least_part(kind: Int[Tensor, " b"], finest: float) -> Float[Tensor, " b"]:
     """Parts of a kind that are not shortened any more, as a share of the path."""
-    found = torch.where(kind == TRY, finest, GLANCE)
-    return torch.where(kind == LOOK, torch.inf, found).double()
+    found = torch.full(kind.shape, GLANCE, dtype=torch.float64, device=kind.device)
+    return found.masked_fill(kind == TRY, finest).masked_fill(kind == LOOK, torch.inf)
 
 
 def next_part(
@@ -106,6 +106,6 @@ def shorter_part(
     expected = (kind == TRY) & (SHY * ahead < gone)
     aims = (kind == AIM) | expected
     length = torch.where(expected, SHY * ahead, 0.5 * gone)
-    length = length.maximum(torch.where(aims, GLANCE, finest))
+    length = length.maximum(torch.full_like(gone, finest).masked_fill(aims, GLANCE))
     after = torch.where(moving, torch.where(aims, AIM, TRY), LOOK)
     return after, torch.where(moving, length, GLANCE)

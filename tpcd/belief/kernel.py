@@ -27,6 +27,7 @@ from tpcd.belief.kernel_filter import (
 from tpcd.simulator.kernel import source_stamp
 from tpcd.simulator.kernel_element import step_element
 from tpcd.simulator.kernel_geometry import World, new_chains
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_request import (
     Answer,
     Request,
@@ -112,7 +113,7 @@ def _compile_explain_range(stamp: int) -> Callable[..., None]:
     return explain_range
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(inline="always")
 @no_type_check
 def _explain_range(points, law, given, measured, by_theta, found, first, last):
     """Evaluate the particles from `first` up to `last`; `points` (m, 2, p) are their outlines."""
@@ -216,7 +217,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                 found.covariance[i, a, b] = state.covariance[a, b]
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _turns(given, i, k):
     """The angle of the object in the hand at the start and at the end of transition k."""
@@ -225,7 +226,7 @@ def _turns(given, i, k):
     return given.turns[i, 0, 0], given.turns[i, 0, 0]
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _meet(here, given, i, row):
     """Take over the planes of a particle at a row."""
@@ -237,7 +238,7 @@ def _meet(here, given, i, row):
         here.offsets[0, t], here.friction[0, t] = given.offsets[p, r, t], given.friction[p, r, t]
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _keep(found, answer, i, k):
     """Keep how the step of transition k settled."""

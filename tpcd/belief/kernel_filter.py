@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
 
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_settle import RELAXED
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -37,7 +37,7 @@ class Filter(NamedTuple):
     gap: np.ndarray
 
 
-@njit
+@inner(_nrt=True)
 @no_type_check
 def new_filter(size, entries, terrains):
     """Room for a filter of so many coefficients over some terrains, with derivatives by so many
@@ -54,7 +54,7 @@ def new_filter(size, entries, terrains):
     )
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def begin(state, measured, seen, sd):
     """The state before any transition."""
@@ -68,7 +68,7 @@ def begin(state, measured, seen, sd):
         state.covariance[a, a] = sd * sd if own < 0 else measured.variance[seen, 0, own]
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def pass_over(state, measured, seen, k, size):
     """Pass over transition k: what is known of the next pose is its reading alone."""
@@ -82,7 +82,7 @@ def pass_over(state, measured, seen, k, size):
             state.by_theta[e, size + a] = 0.0
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def expect_gap(state, measured, k, offsets):
     """Move planes away by what the field is known to change of their gaps at transition k."""
@@ -94,7 +94,7 @@ def expect_gap(state, measured, k, offsets):
         offsets[t] -= state.gap[t]
 
 
-@njit(error_model="numpy", _nrt=False, forceinline=True)
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def assimilate(state, measured, answer, seen, k, sd):
     """Filter the residual of transition k; returns its log density, -inf where it has none."""
@@ -135,7 +135,7 @@ def assimilate(state, measured, answer, seen, k, sd):
     return -0.5 * square - 0.5 * log_determinant - 1.5 * _LOG_2PI
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def _fill_design(design, measured, answer, k, size):
     """How the residual of transition k answers the field's coefficients and the start's error."""
@@ -152,7 +152,7 @@ def _fill_design(design, measured, answer, k, size):
             design[a, size + b] = -answer.from_start[k, a, b]
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def _add_uncovered(factor, measured, answer, k, sd):
     """The part of the outline's error that the bumps do not cover is noise."""
@@ -166,7 +166,7 @@ def _add_uncovered(factor, measured, answer, k, sd):
                 factor[a, b] += uncovered * answer.from_gap[k, t, a] * answer.from_gap[k, t, b]
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def _project(state, size):
     """Covariances of the residual with the state and with itself, and the field taken out of the
@@ -193,7 +193,7 @@ def _project(state, size):
                 factor[a, b] += design[a, r] * cross[b, r]
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def _advance(state, variance, seen, k, size):
     """The state after a transition, from the whitened innovation and the cross covariance.
@@ -226,7 +226,7 @@ def _advance(state, variance, seen, k, size):
             covariance[r, s] -= g0 * gain[0, s] + g1 * gain[1, s] + g2 * gain[2, s]
 
 
-@njit(error_model="numpy", _nrt=False)
+@inner(error_model="numpy")
 @no_type_check
 def follow(state, theta, slopes, i, k, size):
     """Derivatives of the innovation and of the mean by theta, at a fixed gain (Gauss-Newton).
@@ -249,7 +249,7 @@ def follow(state, theta, slopes, i, k, size):
             by_theta[e, r] = value
 
 
-@njit(error_model="numpy", _nrt=False)
+@inner(error_model="numpy")
 @no_type_check
 def _factorise(matrix):
     """Cholesky factor in the lower triangle, in place; returns the log determinant."""
@@ -267,7 +267,7 @@ def _factorise(matrix):
     return result
 
 
-@njit(error_model="numpy", _nrt=False)
+@inner(error_model="numpy")
 @no_type_check
 def _forward(factor, vector):
     """Solve L y = vector in place."""

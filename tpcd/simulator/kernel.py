@@ -3,11 +3,6 @@
 `kernel_geometry` finds lowest points and first touches, `kernel_settle` the rest pose,
 `kernel_linear` and `kernel_slopes` the derivatives, `kernel_element` strings the parts of a
 transition together. Imported only where numba is.
-
-Inner functions run without numba's reference counts (`_nrt=False`): they allocate nothing,
-and counting every array they touch took half of the time. The large ones are put in place of
-their calls (`forceinline`): a call hands over every array field by field, hundreds of numbers,
-which again took half.
 """
 
 from __future__ import annotations
@@ -56,13 +51,15 @@ def _compile_step_range(stamp: int) -> Callable[..., None]:
     return step_range
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(inline="always")
 @no_type_check
 def _step_range(world, law, request, answer, first, last):
     """Step the transitions from `first` up to `last`."""
     terrains, count = world.normals.shape[1], world.points.shape[2]
     chains, space = new_chains(terrains, count), new_space(terrains)
     slopes = new_slopes(terrains, 0)
+    # No entries of theta; an element of it is named by a variable, as in the likelihood, since for
+    # a constant the step would be compiled once more.
     by_theta = SceneSlopes(
         np.zeros((1, 0, 2, 1)), np.zeros((1, 0, terrains)), np.zeros((1, 0, terrains))
     )
@@ -83,7 +80,7 @@ def _step_range(world, law, request, answer, first, last):
             set_stiffness(law, request.stiffness[element if request.stiffness.shape[0] > 1 else 0])
             step_element(
                 here, 0, chains, law, extent, request, element, answer, space, slopes, poses,
-                by_theta, 0,
+                by_theta, o,
             )  # fmt: skip
         b = end
 

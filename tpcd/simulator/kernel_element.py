@@ -9,10 +9,10 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from tpcd.simulator.kernel_events import NOTHING, next_event, respond_until
 from tpcd.simulator.kernel_geometry import first_touch, touching
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system
 from tpcd.simulator.kernel_request import sound, wrap
 from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, may_wedge, settle
@@ -52,7 +52,7 @@ RESTING, STRAIGHT, WALKING, STRAIGHT_AFTER_ALL = 0, 1, 2, 3
 """Stages of a step."""
 
 
-@njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def step_element(
     world, o, chains, law, extent, request, b, answer, space, slopes, poses, by_theta, moved
@@ -220,7 +220,7 @@ def step_element(
     copy_rows(whole, 3 + terrains, answer.from_lever[b], terrains)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _after(attempt, first, ended, coulomb, lighter):
     """The attempt at settling that follows one that ended so, when the `first` did not satisfy or
@@ -235,7 +235,7 @@ def _after(attempt, first, ended, coulomb, lighter):
     return attempt
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _keep(slopes, pose, kept_pose, height, entries):
     """Keep the state that the path begins in."""
@@ -245,7 +245,7 @@ def _keep(slopes, pose, kept_pose, height, entries):
         kept_pose[a] = pose[a]
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _restore(slopes, pose, kept_pose, height, entries):
     """Go back to the state that the path begins in."""
@@ -255,7 +255,7 @@ def _restore(slopes, pose, kept_pose, height, entries):
         pose[a] = kept_pose[a]
 
 
-@njit(error_model="numpy", _nrt=False)
+@inner(error_model="numpy")
 @no_type_check
 def _contacts(world, o, pose, space, contacts, b):
     """Forces of each terrain and the arm of their point, weighted by load."""

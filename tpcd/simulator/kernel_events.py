@@ -11,17 +11,17 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from tpcd.simulator.events import SLOWEST
 from tpcd.simulator.kernel_geometry import lowest_point, object_normal
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import respond
 
 NOTHING = (-1, 0, 0.0)
 """No event."""
 
 
-@njit(error_model="numpy", _nrt=False)
+@inner(error_model="numpy")
 @no_type_check
 def next_event(world, o, chains, law, before, command, pose, space, rate):
     """Share of the path from `before` to `command` until contact changes, and the event.
@@ -61,7 +61,7 @@ def next_event(world, o, chains, law, before, command, pose, space, rate):
     return ahead, (which, point, inverse)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def respond_until(world, o, law, event, pose, space, slopes):
     """Turn the response of a settling into that of the pose at the event."""
@@ -97,7 +97,7 @@ def respond_until(world, o, law, event, pose, space, slopes):
             by_terrain[terrains + t, a] += slopes.rate[a] * inverse * by_lever
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def touch_row(world, o, t, point, pose, row):
     """How the gap of a point to terrain t moves with the pose."""

@@ -16,7 +16,8 @@ import math
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
+
+from tpcd.simulator.kernel_inner import inner
 
 FREE_GAP = 1e-5
 """A start pose flies when every gap exceeds this [m]; as in `flight`."""
@@ -51,7 +52,7 @@ class Chains(NamedTuple):
     index: np.ndarray
 
 
-@njit
+@inner(_nrt=True)
 @no_type_check
 def new_chains(terrains, count):
     """Room for the chains of scenes of `count` points."""
@@ -65,7 +66,7 @@ def new_chains(terrains, count):
     )
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def object_normal(world, o, t, cosine, sine):
     """The normal of terrain t as the object sees it, turned by the angle of cosine and sine."""
@@ -73,7 +74,7 @@ def object_normal(world, o, t, cosine, sine):
     return cosine * nx + sine * nz, cosine * nz - sine * nx
 
 
-@njit(fastmath={"nsz", "contract", "nnan"}, _nrt=False)
+@inner(fastmath={"nsz", "contract", "nnan"})
 @no_type_check
 def _coordinates(points, o, a, b, height, lever, t):
     """Coordinates of all points along (a, b) and across; returns the least height."""
@@ -87,7 +88,7 @@ def _coordinates(points, o, a, b, height, lever, t):
     return lowest
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def build_chains(world, o, low, high, margin, chains):
     """Find the hull pieces of scene o for object angles from `low` to `high` [rad].
@@ -123,7 +124,7 @@ def build_chains(world, o, low, high, margin, chains):
         chains.size[t] = _lower_hull(height, lever, index, t, kept)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _lower_hull(height, lever, index, t, kept):
     """Keep the corners of the lower hull of points sorted by lever (Andrew 1979)."""
@@ -147,7 +148,7 @@ def _lower_hull(height, lever, index, t, kept):
     return size
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def lowest_point(world, o, chains, t, u, v):
     """Least of u x + v z over the outline, and the point that has it."""
@@ -167,7 +168,7 @@ def lowest_point(world, o, chains, t, u, v):
     return lowest, best
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def lowest_gap(world, o, chains, x, z, angle):
     """Smallest gap over all terrains at a pose, with its point and terrain."""
@@ -182,7 +183,7 @@ def lowest_gap(world, o, chains, x, z, angle):
     return best, best_point, best_terrain
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def touching(world, o, chains, pose):
     """Bit mask of the terrains within `FREE_GAP` of the object."""
@@ -197,7 +198,7 @@ def touching(world, o, chains, pose):
     return mask
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def first_touch(world, o, chains, start, command):
     """Free fraction of the way from start to command, with the touching point and terrain.
@@ -228,7 +229,7 @@ def first_touch(world, o, chains, start, command):
     return high, point, terrain
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _touch_of_point(world, o, t, i, start, command, high, gap_high):
     """Fraction of the way, below `high`, at which point i comes to terrain t.

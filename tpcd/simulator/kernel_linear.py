@@ -6,12 +6,11 @@ from __future__ import annotations
 
 from typing import no_type_check
 
-from numba import njit
-
 from tpcd.simulator.kernel_geometry import object_normal
+from tpcd.simulator.kernel_inner import inner
 
 
-@njit(error_model="numpy", _nrt=False, forceinline=True)
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def linear_system(world, o, law, command, pose, turn, space):
     """Residuals and matrices of the rest equations at `pose`, as in `implicit`.
@@ -64,7 +63,7 @@ def linear_system(world, o, law, command, pose, turn, space):
     return _invert(system)
 
 
-@njit(error_model="numpy", _nrt=False)
+@inner(error_model="numpy")
 @no_type_check
 def _invert(system):
     """Invert the 3 x 3 matrix in rows 9-11 in place; False, and zeros, where it is singular."""
@@ -87,7 +86,7 @@ def _invert(system):
     return True
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def respond(space):
     """Pose change for the right-hand sides `force` of the balance and `right` of the rows.

@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
 
 from tpcd.simulator.kernel_geometry import build_chains
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_settle import PROBE
 from tpcd.simulator.kernel_space import Law
 
@@ -51,21 +51,21 @@ class Answer(NamedTuple):
     contacts: np.ndarray
 
 
-@njit
+@inner(_nrt=True)
 @no_type_check
 def new_planes(terrains):
     """Room for the planes of one transition."""
     return np.zeros((1, terrains, 2)), np.zeros((1, terrains)), np.zeros((1, terrains))
 
 
-@njit
+@inner(_nrt=True)
 @no_type_check
 def own_law(law):
     """A copy of the law whose stiffness can be set for each transition."""
     return Law(np.ones(3), np.ones(3), law.coulomb, law.rounds, law.tolerance, law.compliance)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def set_planes(here, normals, offsets, friction, place):
     """Take over the planes at a place of (.., t, 2) and (.., t)."""
@@ -74,7 +74,7 @@ def set_planes(here, normals, offsets, friction, place):
         here.offsets[0, t], here.friction[0, t] = offsets[place, t], friction[place, t]
 
 
-@njit(error_model="numpy")
+@inner(_nrt=True, error_model="numpy")
 @no_type_check
 def set_stiffness(law, stiffness):
     """Take over a stiffness (3) and its root."""
@@ -82,7 +82,7 @@ def set_stiffness(law, stiffness):
         law.stiffness[a], law.root[a] = stiffness[a], math.sqrt(stiffness[a])
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def prepare(world, o, law, request, first, last, chains):
     """Chains of a scene for some transitions; returns how far its outline reaches [m]."""
@@ -94,7 +94,7 @@ def prepare(world, o, law, request, first, last, chains):
     return extent
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _reach(world, o):
     """Distance of the furthest point from the end effector [m]; not finite for a bad outline."""
@@ -107,7 +107,7 @@ def _reach(world, o):
     return math.sqrt(largest) if math.isfinite(total) else np.nan
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def sound(world, o, law):
     """Whether planes and stiffness are finite, and the stiffness positive."""
@@ -120,7 +120,7 @@ def sound(world, o, law):
     return math.isfinite(total)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _angles(request, first, last):
     """Least and largest object angle on the straight ways of some transitions [rad]."""
@@ -137,7 +137,7 @@ def _angles(request, first, last):
     return (low, high) if low <= high else (0.0, 0.0)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _largest(values, o):
     largest = 0.0
@@ -146,7 +146,7 @@ def _largest(values, o):
     return largest
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def wrap(angle):
     """The angle wrapped to (-pi, pi]."""

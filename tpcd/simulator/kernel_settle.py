@@ -11,11 +11,11 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from tpcd.qp.compiled import solve_whitened_3
 from tpcd.qp.problem import Status
 from tpcd.simulator.kernel_geometry import lowest_point, object_normal
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system, respond
 from tpcd.simulator.kernel_space import LIST
 from tpcd.simulator.wedge import PATIENCE
@@ -32,7 +32,7 @@ JAMMED = 4
 _SOLVED = int(Status.SOLVED)
 
 
-@njit(error_model="numpy", _nrt=False, forceinline=True)
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
     """Settle one element, `afresh` from the start or from `pose`; leaves pose and loaded contacts,
@@ -86,7 +86,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
     return status, residual
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def may_wedge(law, space):
     """Whether two terrains load the settled element, which can press on each other through it."""
@@ -101,7 +101,7 @@ def may_wedge(law, space):
     return second >= 0 and law.coulomb
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space):
     """List the points that could carry load at a pose, in round k; turns as (cos, sin)."""
@@ -132,7 +132,7 @@ def _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, sp
             _add(world, o, t, point, start, u_start, v_start, space)
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _add(world, o, t, point, start, u_start, v_start, space):
     """Put a point on the list of terrain t; when full it replaces the oldest."""
@@ -152,7 +152,7 @@ def _add(world, o, t, point, start, u_start, v_start, space):
     place[t, k, 3] = -(u_start * x + v_start * z)
 
 
-@njit(error_model="numpy", _nrt=False, forceinline=True)
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def _build_rows(world, o, law, command, pose, turn, space):
     """Unit whitened rows of all listed candidates, linearised at `pose`; returns their number."""
@@ -201,7 +201,7 @@ def _build_rows(world, o, law, command, pose, turn, space):
     return m
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def _choose(world, o, law, pose, turn, space):
     """Read the loaded rows off the solved problem; returns the largest change of load [N]."""

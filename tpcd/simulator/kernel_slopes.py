@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
 
 from tpcd.simulator.kernel_events import touch_row
 from tpcd.simulator.kernel_geometry import object_normal
+from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import respond
 
 GRAZING = 1e-9
@@ -55,7 +55,7 @@ class SceneSlopes(NamedTuple):
     friction: np.ndarray
 
 
-@njit
+@inner(_nrt=True)
 @no_type_check
 def new_slopes(terrains, entries):
     """Room for the derivatives of one element."""
@@ -74,7 +74,7 @@ def new_slopes(terrains, entries):
     )
 
 
-@njit(error_model="numpy", _nrt=False, forceinline=True)
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def landing_response(world, o, start, command, fraction, point, terrain, slopes):
     """Derivatives of the first-touch pose by start (rows 0-2), command (3-5) and gaps."""
@@ -106,7 +106,7 @@ def landing_response(world, o, start, command, fraction, point, terrain, slopes)
             land[3 + a, c] = fraction * turn
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def settling_response(law, terrains, space, slopes):
     """Derivatives of the settled pose by start, command, and gap and lever of each terrain.
@@ -140,7 +140,7 @@ def settling_response(law, terrains, space, slopes):
             slopes.by_terrain[terrains + t, a] = yields[a, 2] * space.load[t]
 
 
-@njit(_nrt=False, forceinline=True)
+@inner(forceinline=True)
 @no_type_check
 def append_part(slopes, follows, column, middle):
     """Append one settling to the derivatives of the whole step.
@@ -176,7 +176,7 @@ def append_part(slopes, follows, column, middle):
             whole[3 + r, a] = value
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, space, slopes):
     """Append one settling to the derivatives of the whole step by theta.
@@ -231,7 +231,7 @@ def append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, sp
             theta[e, a] = value
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def _pass_theta(world, o, by_theta, moved, e, event, pose, space, rate):
     """Let the change of the pose with an entry of theta be that at an event, which moves too."""
@@ -252,7 +252,7 @@ def _pass_theta(world, o, by_theta, moved, e, event, pose, space, rate):
         space.change[a] += rate[a] * inverse * later
 
 
-@njit(_nrt=False)
+@inner
 @no_type_check
 def copy_rows(source, first, target, count):
     """Copy rows of three from `first` on; numba's slices would allocate."""

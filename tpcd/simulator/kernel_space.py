@@ -7,7 +7,8 @@ from __future__ import annotations
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
+
+from tpcd.simulator.kernel_inner import inner
 
 LIST = 8
 """Candidate points kept for each terrain."""
@@ -63,7 +64,7 @@ class Space(NamedTuple):
     friction: np.ndarray
 
 
-@njit
+@inner(_nrt=True)
 @no_type_check
 def new_space(terrains):
     """Room for one element at a time against so many terrains."""

@@ -58,4 +58,6 @@ $(INSTALLED): pins.txt pyproject.toml
 	echo "Setting up .venv with $$("$$found" --version) (a few minutes the first time)"; \
 	"$$found" -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c pins.txt -e ".[$(EXTRAS)]"
+	@echo "Compiling the loops, once"
+	$(BIN)/python -m tpcd.compile_ahead
 	@touch $@

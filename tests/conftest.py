@@ -23,8 +23,11 @@ def checked_modules() -> list[str]:
     if sys.version_info >= (3, 11):
         return ["tpcd"]
     root = Path(__file__).resolve().parents[1]
+    marks = ("from numba import", "kernel_inner import")
     plain = [
-        path for path in root.glob("tpcd/**/*.py") if "from numba import" not in path.read_text()
+        path
+        for path in root.glob("tpcd/**/*.py")
+        if not any(mark in path.read_text() for mark in marks)
     ]
     modules = [path for path in plain if path.name != "__init__.py"]
     return [".".join(path.relative_to(root).with_suffix("").parts) for path in modules]

@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from shutil import copy
 
 import pytest
 import torch
@@ -210,7 +211,10 @@ def test_estimate_takes_what_was_found_and_predict_then_needs_no_model(
 ) -> None:
     """The floor of these data is rigid: a prior of all compliances would be near 0."""
     path = write_model(soft(2e-4, 1e-5), tmp_path / "model.yaml")
-    episode, out = str(world / "explore.csv"), tmp_path / "run"
+    rows = (world / "explore.csv").read_text().splitlines()[:4]
+    (tmp_path / "start.csv").write_text("\n".join(rows) + "\n")
+    copy(world / "explore.yaml", tmp_path / "start.yaml")
+    episode, out = str(tmp_path / "start.csv"), tmp_path / "run"
     arguments = ("--prior", "ycb21-z2", "--particles", "32", "--out", str(out))
     assert call("estimate", episode, *arguments, "--model", str(path)) == 0
     (kept,) = load_model(out / "model.yaml").effects

@@ -62,7 +62,9 @@ def bench_of(episode: Episode, told: list[str]) -> Workbench:
     ("kind", "hidden", "found"),
     [
         ("mujoco", {"friction_field": {"slope": 6.0}}, FIELD),
-        ("quasistatic", {"wall_friction": {"log_ratio": -0.6}}, WALL),
+        pytest.param(
+            "quasistatic", {"wall_friction": {"log_ratio": -0.6}}, WALL, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_law_of_place_takes_the_place_of_another_wall_and_not_of_a_true_one(

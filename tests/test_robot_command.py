@@ -26,6 +26,7 @@ def robot_command(*arguments: str) -> int:
     return int(stopped.value.code or 0)
 
 
+@pytest.mark.slow
 def test_the_whole_experiment_of_fifteen_moves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

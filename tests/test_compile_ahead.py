@@ -1,0 +1,51 @@
+"""Compiling ahead: what it makes is what estimation then takes."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+
+from tpcd import compile_ahead
+
+# Counts what numba compiles or loads for an estimate that comes after.
+USE = """
+import torch
+from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+from tpcd.belief import kernel as filtered, mixture_kernel
+from tpcd.compile_ahead import compile_loops
+from tpcd.predict import ContactPredictor
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior
+from tpcd.simulator import kernel
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+compile_loops()
+loops = (kernel.step_range, filtered.explain_range, mixture_kernel.sum_range)
+before = [len(loop.signatures) for loop in loops]
+generator = torch.Generator().manual_seed(1)
+scene = draw_scene("milk_carton", builtin_outlines()["milk_carton"].vertices, generator)
+motion = make_motion("rich", scene, 2, generator)
+episode = record(make_truth(scene, "quasistatic"), scene, motion, 2, generator).measured
+settings = EstimatorSettings(sampler=SamplerSettings(particles=50))
+*_, last = estimate(episode, load_prior("ycb-rich"), generator, settings)
+ContactPredictor(last.belief).predict(episode.poses[:1], episode.commands[1:2])
+print(before, [len(loop.signatures) for loop in loops])
+"""
+
+
+def test_nothing_is_left_to_compile_for_an_estimate() -> None:
+    pytest.importorskip("numba")
+    found = subprocess.run(
+        [sys.executable, "-c", USE], capture_output=True, text=True, check=False, timeout=500
+    )
+    assert found.stdout.strip() == "[1, 1, 1] [1, 1, 1]", found.stderr
+
+
+def test_without_numba_there_is_nothing_to_compile(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert compile_ahead.main() == 0
+    assert "nothing to compile" in capsys.readouterr().out

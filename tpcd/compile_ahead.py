@@ -1,0 +1,49 @@
+"""Compile the loops ahead of their first use: `python -m tpcd.compile_ahead`.
+
+numba keeps compiled loops beside the sources, and makes them again where these have changed. Else
+the first command that needs them waits for that, in the middle of its work.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+
+
+def compile_loops() -> None:
+    """Simulate two steps of contact and learn from them, by all loops that estimation needs."""
+    import torch
+
+    from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.predict import ContactPredictor
+    from tpcd.shape.builtin import builtin_outlines
+    from tpcd.shape.polygon import PolygonShape
+    from tpcd.truth.recording import make_motion, record
+    from tpcd.truth.scene import draw_scene, make_truth
+
+    generator = torch.Generator().manual_seed(0)
+    outline = builtin_outlines()["mug"]
+    scene = draw_scene("mug", outline.vertices, generator)
+    motion = make_motion("rich", scene, 2, generator)
+    episode = record(make_truth(scene, "quasistatic"), scene, motion, 2, generator).measured
+    settings = EstimatorSettings(sampler=SamplerSettings(particles=20))
+    *_, last = estimate(episode, PolygonShape(outline), generator, settings)
+    ContactPredictor(last.belief).predict(
+        episode.poses[:-1], episode.commands[1:], previous=episode.commands[:-1]
+    )
+
+
+def main() -> int:
+    """Compile what is not compiled yet, and say how long that took."""
+    if importlib.util.find_spec("numba") is None:
+        print("numba is not installed (extra `fast`): there is nothing to compile")
+        return 0
+    began = time.perf_counter()
+    compile_loops()
+    print(f"the compiled loops are ready ({time.perf_counter() - began:.0f} s)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

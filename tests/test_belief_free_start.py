@@ -184,6 +184,12 @@ def test_before_any_transition_draws_are_weighted_by_it(shape: PolygonShape) -> 
     deep, clear = belief.weights[gap < -8e-3], belief.weights[gap > 8e-3]
     assert len(deep) > 20 and float(deep.sum()) < 1e-3
     assert float(clear.max() - clear.median()) < 1e-4
+    pressed = torch.tensor([0.0, 5e-3, 0.0], dtype=torch.float64)
+    leans = replace(
+        start, commands=start.commands - pressed, wrenches=start.wrenches + STIFFNESS * pressed
+    )
+    loaded = prior_belief(leans, shape, torch.Generator().manual_seed(0))
+    assert float(loaded.weights.max() - loaded.weights.min()) == 0.0
     below = torch.tensor([0.0, 0.2, 0.0])
     nowhere = replace(start, poses=start.poses - below, commands=start.commands - below)
     lost = prior_belief(nowhere, shape, torch.Generator().manual_seed(0))

@@ -24,7 +24,7 @@ from tpcd.belief.cloud import (
     cloud_to_tensors,
     start_cloud,
 )
-from tpcd.belief.free_start import start_gaps
+from tpcd.belief.free_start import rests_free, start_gaps
 from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
 from tpcd.belief.misfit import MisfitField
@@ -179,10 +179,10 @@ def prior_belief(
     generator: torch.Generator,
     settings: EstimatorSettings | None = None,
 ) -> Belief:
-    """The belief before any transition: draws from the prior, weighted by how likely they leave the
-    start pose free.
+    """The belief before any transition: draws from the prior, weighted by how likely they leave a
+    start pose free that bears no load.
 
-    Where none does (an object that leans on something at once), all of them alike.
+    Where it bears one, or none of the draws leaves it free, all of them alike.
     """
     settings = settings or EstimatorSettings()
     target = target_of(episode, shape, settings)
@@ -195,7 +195,8 @@ def prior_belief(
         scene.points_ee, history.setting(scene), history.poses[:, 2], torch.tensor([0])
     )
     free = starts.log_free_before(misfit, sd).exp()
-    weights = free if float(free.max()) > _SOME_FREE else torch.ones_like(free)
+    tells = bool(rests_free(history)[0]) and float(free.max()) > _SOME_FREE
+    weights = free if tells else torch.ones_like(free)
     size = misfit.bumps * len(scene.terrains)
     return Belief(
         prior=prior,

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.belief.history import History
@@ -22,13 +22,17 @@ from tpcd.effects.conditions import angle_difference
 from tpcd.planar import perpendicular, rotate
 
 
+def rests_free(history: History) -> Bool[Tensor, " rows"]:
+    """Whether the arm rests where it was commanded, as far as noise tells."""
+    offset = angle_difference(history.poses, history.commands)
+    return (offset**2 / history.variance).sum(-1) < PARITY_LIMIT
+
+
 def free_starts(history: History) -> Int[Tensor, " f"]:
     """Rows with which a recording begins at rest where it was commanded, if what follows counts."""
     first = torch.ones_like(history.used)
     first[1:] = history.seams[:-1]
-    offset = angle_difference(history.start, history.previous)
-    square = (offset**2 / history.variance[:-1]).sum(-1)
-    return torch.nonzero(first & history.used & (square < PARITY_LIMIT)).flatten()
+    return torch.nonzero(first & history.used & rests_free(history)[:-1]).flatten()
 
 
 @dataclass(frozen=True)

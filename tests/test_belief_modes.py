@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings, start_cloud
+from tpcd.belief.cloud import CURVATURE_COST, Counted, SamplerSettings, start_cloud
 from tpcd.belief.importance import draw_pool
-from tpcd.belief.modes import climb, climb_with_the_best, climbing_cost, find_modes, log_target
+from tpcd.belief.modes import climb, climb_with_the_best, find_modes, log_target, set_out
 
 DIMENSION = 2
 CENTRES = torch.tensor([[2.0, 0.0], [-2.0, 1.0], [0.0, -3.0]], dtype=torch.float64)
@@ -53,23 +53,64 @@ def test_a_climb_gains_at_every_step_and_arrives() -> None:
     start = target.sample(50, torch.Generator().manual_seed(0))
     heights = [log_target(target, start)]
     for rounds in (1, 2, 4, 8):
-        points, height = climb(target, start, rounds)
-        assert (height >= heights[-1]).all()
-        heights.append(height)
-    assert ((points[:, None] - CENTRES).norm(dim=-1).amin(-1) < 0.01).all()
+        arrived = climb(target, set_out(target, start), rounds)
+        assert (arrived.height >= heights[-1]).all()
+        torch.testing.assert_close(arrived.height, log_target(target, arrived.points))
+        heights.append(arrived.height)
+    assert ((arrived.points[:, None] - CENTRES).norm(dim=-1).amin(-1) < 0.01).all()
 
 
 def test_the_lower_half_gives_up_until_as_many_are_left_as_may_be_kept() -> None:
     target = ThreeModes()
     start = target.sample(40, torch.Generator().manual_seed(0))
     settings = SamplerSettings(modes=10, climbing_rounds=0)
-    best, evaluations = climb_with_the_best(target, start, settings)
-    height = log_target(target, start)
-    torch.testing.assert_close(best, start[height.argsort(descending=True)[:10]])
-    assert evaluations == climbing_cost(40, 0) + climbing_cost(20, 0) == 60
-    all_kept, evaluations = climb_with_the_best(target, start[:10], settings)
-    torch.testing.assert_close(all_kept, start[:10])
-    assert evaluations == 0
+    climbers = set_out(target, start)
+    best = climb_with_the_best(target, climbers, settings)
+    index = climbers.height.argsort(descending=True)[:10]
+    torch.testing.assert_close(best.points, start[index])
+    torch.testing.assert_close(best.height, climbers.height[index])
+    all_kept = climb_with_the_best(target, climbers[torch.arange(10)], settings)
+    torch.testing.assert_close(all_kept.points, start[:10])
+
+
+def test_where_a_step_did_not_gain_nothing_is_surveyed_again() -> None:
+    asked: list[Tensor] = []
+
+    class Steep(ThreeModes):
+        """Steps of thrice their length gain only from far away, or after some damping."""
+
+        def curvature(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            asked.append(x)
+            gradient, information = super().curvature(x)
+            return gradient, information / 3
+
+    target = Steep()
+    counted = Counted(target)
+    start = target.sample(30, torch.Generator().manual_seed(3))
+    arrived = climb(counted, set_out(counted, start), 5)
+    points = torch.cat(asked)
+    assert len(points) == len(points.unique(dim=0)) < 5 * 30
+    assert counted.evaluations == (1 + 5) * 30 + CURVATURE_COST * len(points)
+    surveyed = arrived.surveyed(counted)
+    gradient, information = target.curvature(arrived.points)
+    torch.testing.assert_close(surveyed.gradient, gradient)
+    torch.testing.assert_close(surveyed.information, information)
+
+
+def test_a_step_need_only_be_followed_as_far_as_it_can_gain() -> None:
+    target = ThreeModes()
+    points = target.sample(20, torch.Generator().manual_seed(4))
+    height = log_target(target, points)
+    asked: list[Tensor] = []
+
+    class Limited(ThreeModes):
+        def log_likelihood(self, x: Tensor, least: Tensor | None) -> Tensor:
+            assert least is not None
+            asked.append(least)
+            return super().log_likelihood(x, least)
+
+    torch.testing.assert_close(log_target(Limited(), points, height - 1.0), height)
+    torch.testing.assert_close(asked[0], target.log_likelihood(points, None) - 1.0)
 
 
 def test_each_mode_is_found_once_and_remembered() -> None:

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from tpcd.belief.proposals import DAMPINGS
 
+CURVATURE_COST = 3
+"""Evaluations that gradient and information cost together."""
+
 
 @runtime_checkable
 class Target(Protocol):
@@ -37,6 +40,36 @@ class Target(Protocol):
         """Gradient (m, d) and information (m, d, d), positive semi-definite, of the log
         posterior. Only proposals depend on them, so they need not be exact."""
         ...
+
+
+@dataclass
+class Counted:
+    """A target that counts the evaluations that it is asked for."""
+
+    target: Target
+    evaluations: int = 0
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Of the target."""
+        return self.target.sample(count, generator)
+
+    def scatter(self, count: int, generator: torch.Generator) -> Tensor:
+        """Of the target."""
+        return self.target.scatter(count, generator)
+
+    def log_prior(self, positions: Tensor) -> Tensor:
+        """Of the target."""
+        return self.target.log_prior(positions)
+
+    def log_likelihood(self, positions: Tensor, least: Tensor | None) -> Tensor:
+        """Of the target."""
+        self.evaluations += len(positions)
+        return self.target.log_likelihood(positions, least)
+
+    def curvature(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the target."""
+        self.evaluations += CURVATURE_COST * len(positions)
+        return self.target.curvature(positions)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import Cloud, CloudInfo, SamplerSettings, Target
-from tpcd.belief.modes import CURVATURE_COST, climb, climbing_cost, find_modes
+from tpcd.belief.cloud import Cloud, CloudInfo, Counted, SamplerSettings, Target
+from tpcd.belief.modes import Climbers, climb, find_modes, set_out
 from tpcd.belief.pareto import tail_shape
 from tpcd.belief.pool import (
     Pool,
@@ -87,17 +87,16 @@ def draw_pool(
     generator: torch.Generator,
 ) -> Pool:
     """Adapt a mixture that starts at the cloud and the modes, and draw from it."""
+    target = Counted(target)
     peaks = find_modes(target, cloud.modes, settings, generator)
-    followed, evaluations = _follow(cloud, target, settings, generator)
     shares = cloud.shares
     counts = _counts(shares, settings.draws_per_place)
     mixture = CurvedMixture.joined(
         [
-            curved_mixture(peaks.points, peaks.gradient, peaks.information, counts),
-            curved_mixture(followed, *target.curvature(followed), counts),
+            curved_mixture(each.points, each.gradient, each.information, counts)
+            for each in (peaks, _follow(cloud, target, settings, generator))
         ]
     )
-    evaluations += peaks.evaluations + CURVATURE_COST * len(followed)
     trial = _of_prior(target, max(1, settings.prior_draws // datum), generator)
     for left in reversed(range(settings.rounds)):
         trial, by_damping = trial.add(target, mixture, generator)
@@ -110,15 +109,12 @@ def draw_pool(
         centres = trial.positions[_spread_choice(log_weights, settings.places, generator)]
         counts = _counts(shares, settings.draws_per_place)
         mixture = curved_mixture(centres, *target.curvature(centres), counts)
-        evaluations += CURVATURE_COST * len(centres)
-    evaluations += len(trial.positions)
     assert trial.mixture is not None
     proposal = Proposal(trial.mixture, trial.from_prior)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
     best = float(trial.log_weights.topk(min(_TRUSTED, len(trial.positions))).values[-1])
     drawn = weigh(target, proposal, settings.draws, best, generator)
-    evaluations += settings.draws
-    return Pool(*drawn, peaks.points, shares, evaluations)
+    return Pool(*drawn, peaks.points, shares, target.evaluations)
 
 
 def _counts(shares: Tensor, total: int) -> Tensor:
@@ -183,16 +179,15 @@ def _of_prior(target: Target, count: int, generator: torch.Generator) -> _Draws:
 
 def _follow(
     cloud: Cloud, target: Target, settings: SamplerSettings, generator: torch.Generator
-) -> tuple[Tensor, int]:
-    """Particles that explain the new datum best, a damped Newton step on, and the cost."""
+) -> Climbers:
+    """Particles that explain the new datum best, a damped Newton step on."""
     gain = target.log_likelihood(cloud.positions, None) - cloud.log_likelihood
     log_weights = torch.where(torch.isfinite(gain), gain, -torch.inf) + cloud.weights.log()
     if not bool(torch.isfinite(log_weights).any()):
         # Nobody explains it; the places then are those of the history before.
         log_weights = cloud.weights.log()
     places = cloud.positions[_spread_choice(log_weights, settings.places, generator)]
-    followed, _ = climb(target, places, 1)
-    return followed, len(gain) + climbing_cost(len(places), 1)
+    return climb(target, set_out(target, places), 1).surveyed(target)
 
 
 def _spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.modes import climb
+from tpcd.belief.modes import climb, set_out
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.evidence import Fit, Question, carried, fit_stream
@@ -68,22 +68,22 @@ def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _
     generator = fit_stream(question, effects, 0)
     # Two parameters, such as how high a step is and where, are rarely right by chance together.
     count = min(PLACES * len(effects[-1].parameters) ** 2, MOST_PLACES)
-    start = carried(base, prior, generator, count, repeat=count > PLACES)
+    start = set_out(target, carried(base, prior, generator, count, repeat=count > PLACES))
     if count > PLACES:
-        begun, height = climb(target, start, FRESH_ROUNDS)
-        start = begun[height.topk(PLACES).indices]
+        begun = climb(target, start, FRESH_ROUNDS)
+        start = begun[begun.height.topk(PLACES).indices]
     if fresh:
-        begun, height = climb(target, target.scatter(fresh, generator), FRESH_ROUNDS)
-        best = height.topk(min(KEPT, fresh)).indices
-        start = torch.cat((start, begun[best]))
-    points, height = climb(target, start, ROUNDS)
-    best = height.topk(min(2, len(height))).indices
-    _, information = target.curvature(points[best])
+        begun = set_out(target, target.scatter(fresh, generator))
+        begun = climb(target, begun, FRESH_ROUNDS)
+        start = start.beside(begun[begun.height.topk(min(KEPT, fresh)).indices])
+    arrived = climb(target, start, ROUNDS)
+    best = arrived[arrived.height.topk(min(2, len(arrived.height))).indices].surveyed(target)
+    information = best.information
     width = -0.5 * torch.linalg.slogdet(information).logabsdet
-    each = height[best] + width + 0.5 * information.shape[-1] * math.log(2 * math.pi)
+    each = best.height + width + 0.5 * information.shape[-1] * math.log(2 * math.pi)
     top = int(each.argmax())
     covariance = torch.linalg.inv(information[top])
-    vector, slope = prior.to_vector_with_slope(points[best[top]][:-1])
+    vector, slope = prior.to_vector_with_slope(best.points[top][:-1])
     own = slice(len(vector) - len(effects[-1].parameters), len(vector))
     sd = covariance.diagonal()[:-1].sqrt() * slope
-    return _Peak(float(each[top]), tuple(sd[own].tolist()), points[best[top]])
+    return _Peak(float(each[top]), tuple(sd[own].tolist()), best.points[top])

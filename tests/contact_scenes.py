@@ -8,9 +8,11 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from tpcd.contact import ContactScene, place_points
+from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.contact import ContactScene, place_points, scene_from_parameters
+from tpcd.parameters import Parameters
 from tpcd.planar import transform_points
-from tpcd.shape.builtin import ENTRIES, make_entry
+from tpcd.shape.builtin import ENTRIES, builtin_outlines, make_entry
 from tpcd.shape.polygon import PolygonShape
 from tpcd.terrain import floor, wall
 
@@ -146,3 +148,22 @@ def regular_polygon(count: int, radius: float) -> Tensor:
     """Corners of a regular polygon about the origin [m]."""
     angles = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
     return radius * torch.stack((angles.cos(), angles.sin()), dim=-1)
+
+
+def flush_corner(count: int) -> tuple[ParameterPrior, Tensor, Tensor, Tensor, Tensor]:
+    """Cartons of many sizes and frictions that stand flush in a corner: their prior and theta, a
+    start pose and two commands that press them into it."""
+    prior = make_prior(PolygonShape(builtin_outlines()["milk_carton"]))
+    generator = torch.Generator().manual_seed(2)
+    vectors = prior.to_vector(prior.sample(count, generator))
+    place = prior.names.index
+    points = scene_from_parameters(prior.shape, Parameters.from_vector(vectors)).points_ee
+    vectors[:, place("floor_height")] = points[..., 1].amin(-1)
+    vectors[:, place("wall_position")] = points[..., 0].amax(-1)
+    friction = torch.rand(count, generator=generator, dtype=torch.float64)
+    vectors[:, place("friction")] = 0.2 + 0.7 * friction
+    start, before, command = (
+        torch.tensor(each, dtype=torch.float64)
+        for each in ((0.003, -0.003, 0.01), (0.01, -0.01, 0.0), (0.004, -0.02, 0.03))
+    )
+    return prior, vectors, start, before, command

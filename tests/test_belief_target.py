@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from contact_scenes import STIFFNESS, flush_corner
 from torch import Tensor
 
 from tpcd.belief.history import history_of
@@ -98,6 +99,37 @@ def test_settled_poses_move_with_theta_as_automatic_derivatives_say(
             compared += int((expected[usable].abs().amax(-1) > 1e-3).sum())
     assert compared > 40
     assert located > 2 or substeps == 1 or friction == "anitescu"
+
+
+@needs_numba
+def test_friction_that_is_left_out_moves_nothing() -> None:
+    """What jams in a corner is answered without friction, where it rests before it sets out too."""
+    settings = StepSettings(friction="anitescu")
+    prior, vectors, start, before, command = flush_corner(100)
+    friction = prior.names.index("friction")
+    vectors[:, friction] = 1.2 + 2.0 * (vectors[:, friction] - 0.2) / 0.7
+    poses, commands = torch.stack((start, start)), torch.stack((before, command))
+    noise = torch.tensor([2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02]).double()
+    episode = Episode(commands, poses, STIFFNESS * (poses - commands), STIFFNESS, noise)
+    history = history_of(episode)
+    found, _ = linearised_likelihood(
+        prior.shape,
+        vectors,
+        torch.ones_like(vectors),
+        torch.zeros(100).double(),
+        history,
+        MisfitField(0.0),
+        settings,
+    )
+    theta = vectors.clone().requires_grad_()
+    scene = scene_from_parameters(prior.shape, Parameters.from_vector(theta))
+    asked = (history.poses[0].expand(100, 3), command, STIFFNESS, settings)
+    there = simulate_step(scene, *asked, previous=before)
+    (expected,) = torch.autograd.grad(there.pose[:, 0].sum(), theta)
+    unit = found.log_scale[:, 0, 0].exp()
+    slopes = -unit * found.slopes[:, friction, 0, 0]
+    assert (slopes - expected[:, friction]).abs().max() < 1e-4
+    assert float(expected.abs().max()) > 1e-2
 
 
 @needs_numba

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from inspect import unwrap
 
 import pytest
 import torch
@@ -68,10 +69,21 @@ def test_a_rollout_is_steps_in_a_row(engine):
 # The door
 
 
-@pytest.mark.parametrize("stiffness", [(0.0, 1, 1), (1.0, -1, 1), (1.0, 1, math.nan)])
+@pytest.mark.parametrize(
+    "stiffness", [(0.0, 1, 1), (1.0, -1, 1), (1.0, 1, math.nan), (1, math.inf, 1)]
+)
 def test_stiffness_that_is_not_positive_is_refused(stiffness):
     with pytest.raises(ValueError, match="stiffness is .*, expected three positive"):
         simulate_step(make_scene(), vector(0, 1, 0), vector(0, 1, 0), vector(*stiffness))
+
+
+@pytest.mark.parametrize("name", ["pose", "command", "previous"])
+def test_poses_of_another_width_are_refused(name):
+    given = dict.fromkeys(("pose", "command", "previous"), vector(0, 1, 0))
+    given[name] = vector(0, 1)
+    with pytest.raises(ValueError, match=rf"{name} has shape \(2,\), expected three"):
+        # The tests' own check of shapes would come first.
+        unwrap(simulate_step)(make_scene(), stiffness=STIFFNESS, **given)
 
 
 def test_settings_that_mean_nothing_are_refused():
@@ -79,8 +91,15 @@ def test_settings_that_mean_nothing_are_refused():
         {"friction": "viscous"},
         {"substeps": 0},
         {"rounds": 0},
+        {"substeps": 2.5},
+        {"substeps": 10**6},
+        {"rounds": 2.5},
         {"compliance": -1.0},
+        {"compliance": math.nan},
+        {"compliance": math.inf},
         {"tolerance": 0.0},
+        {"tolerance": math.nan},
+        {"largest_turn": 1e-9},
         {"largest_turn": 0.0},
         {"finest": 1e-8},
         {"finest": 1.5},

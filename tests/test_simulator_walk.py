@@ -13,8 +13,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from contact_scenes import make_scene
+from contact_scenes import BOX, STIFFNESS, flush_corner, make_scene, vector
 
+from tpcd.contact import scene_from_parameters
+from tpcd.parameters import Parameters
 from tpcd.shape.builtin import ENTRIES, make_entry
 from tpcd.simulator import StepSettings, simulate_step
 from tpcd.simulator.walk import (
@@ -63,8 +65,11 @@ def compiled_walk():
     ],
 )
 def test_only_what_the_way_decides_is_cut(before, now, alike):
-    found = ends_alike(torch.tensor([before]), torch.tensor([now]))
-    assert found.tolist() == [alike]
+    rows = (torch.tensor([before]), torch.tensor([now]))
+    assert ends_alike(*rows, torch.tensor([True])).tolist() == [alike]
+    # Where nothing slid, only what else is touched can make a difference.
+    touched_alike = [b == FREE for b in before] == [n == FREE for n in now]
+    assert ends_alike(*rows, torch.tensor([False])).tolist() == [alike or touched_alike]
 
 
 @pytest.mark.parametrize("terrains", [1, 2, 3])
@@ -73,13 +78,14 @@ def test_compiled_loops_cut_as_torch_does(terrains):
     modes = list(itertools.product(range(4), repeat=terrains))
     settings = StepSettings(substeps=3, largest_turn=0.1)
     request = SimpleNamespace(substeps=3, largest_turn=0.1, follow_path=False)
-    for before, now in itertools.product(modes, modes):
-        rows = (torch.tensor([before]), torch.tensor([now]))
+    for before, now, slid in itertools.product(modes, modes, (False, True)):
+        rows = (torch.tensor([before]), torch.tensor([now]), torch.tensor([slid]))
         codes = [sum(mode << 2 * t for t, mode in enumerate(each)) for each in (before, now)]
-        assert kernel.ends_alike(*codes, terrains) == bool(ends_alike(*rows))
+        codes += [terrains, slid]
+        assert kernel.ends_alike(*codes) == bool(ends_alike(*rows))
         for turn in (0.0, 0.3, -0.41):
             parts = parts_of_path(settings, torch.tensor([turn], dtype=torch.float64), *rows)
-            assert kernel.parts_of_path.py_func(request, turn, *codes, terrains) == int(parts)
+            assert kernel.parts_of_path.py_func(request, turn, *codes) == int(parts)
 
 
 def test_parts_end_at_their_grid_and_at_the_command():
@@ -167,15 +173,13 @@ def by_mujoco(scene: Scene, commands: torch.Tensor, settings: MujocoSettings) ->
 
 
 def test_both_engines_walk_alike():
-    """Every answer, where parts are halved: modes, forces and derivatives too."""
+    """Every answer, where parts are halved, in all but a few of 240 transitions: where something
+    is about to slip back and forth, rounding decides."""
     pytest.importorskip("numba")
-    halved = 0
-    for scene, commands in moved_scenes()[3:7]:
+    halved = unlike = elsewhere = 0
+    for scene, commands in moved_scenes():
         truth = by_model(scene, commands)
-        model = make_scene(
-            scene.vertices_ee, scene.friction, scene.floor_height, scene.wall_position
-        )
-        asked = (model, truth[:-1], commands[1:], scene.stiffness)
+        asked = (model_of(scene), truth[:-1], commands[1:], scene.stiffness)
         found, other, coarse = (
             simulate_step(*asked, settings, engine, previous=commands[:-1])
             for settings, engine in (
@@ -184,19 +188,49 @@ def test_both_engines_walk_alike():
                 (StepSettings(finest=1.0), "native"),
             )
         )
-        assert torch.equal(found.mode, other.mode) and torch.equal(found.status, other.status)
+        assert torch.equal(found.status, other.status)
+        off = (found.pose - other.pose).abs().amax(-1) > 1e-6
         # Between two terrains, forces answer ten thousandfold to where it has settled [N/m].
-        for name, near in (
-            ("pose", 1e-6),
-            ("contacts", 1e-3),
-            ("pose_from_start", 1e-3),
-            ("pose_from_gap", 1e-3),
-            ("pose_from_lever", 1e-3),
-        ):
-            ours, theirs = getattr(found, name), getattr(other, name)
-            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=near, msg=name)
+        differs = off | (found.mode != other.mode).any(-1)
+        for name in ("contacts", "pose_from_start", "pose_from_gap", "pose_from_lever"):
+            ours, theirs = (getattr(each, name).flatten(1) for each in (found, other))
+            differs |= ((ours - theirs).abs() > 1e-3 + 1e-4 * theirs.abs()).any(-1)
+        unlike, elsewhere = unlike + int(differs.sum()), elsewhere + int(off.sum())
         halved += int(((found.pose - coarse.pose).abs().amax(-1) > 1e-6).sum())
-    assert halved >= 3
+    assert elsewhere <= 3 and unlike <= 6
+    assert halved >= 12
+
+
+def test_in_a_corner_both_engines_end_where_the_path_leads():
+    """Where nothing slides, rows that carry load may change without end: that is no change."""
+    pytest.importorskip("numba")
+    prior, vectors, start, before, command = flush_corner(150)
+    scene = scene_from_parameters(prior.shape, Parameters.from_vector(vectors)).double()
+    asked = (scene, start.expand(150, 3), command, STIFFNESS)
+    fine = StepSettings(substeps=300, finest=1.0, follow_path=True, rounds=40)
+    native, other, truth = (
+        simulate_step(*asked, settings, engine, previous=before).pose[:, :2]
+        for settings, engine in (
+            (StepSettings(), "native"),
+            (StepSettings(), "torch"),
+            (fine, "native"),
+        )
+    )
+    assert ((native - other).abs().amax(-1) < 5e-5).all()
+    assert int(((native - truth).abs().amax(-1) > 5e-5).sum()) <= 2
+
+
+def test_what_changes_here_and_now_does_not_multiply_derivatives():
+    """A box stands flush at a wall, with one corner held and another about to be touched."""
+    pytest.importorskip("numba")
+    generator = torch.Generator().manual_seed(1)
+    noise = 1e-4 * torch.randn(2, 2000, 3, generator=generator).double()
+    start = vector(0.276186, 0.0435023, 0.000933) + noise[0]
+    command = vector(0.271535, 0.0506291, -0.010457) + noise[1]
+    scene = make_scene(BOX, 0.9, 0.0, 0.3)
+    found = simulate_step(scene, start, command, STIFFNESS, engine="native", previous=start)
+    for name in ("pose_from_start", "pose_from_gap", "pose_from_lever"):
+        assert float(getattr(found, name).abs().max()) < 10.0
 
 
 def moved_transitions() -> list[tuple[Scene, torch.Tensor, torch.Tensor]]:

@@ -18,7 +18,8 @@ from tpcd.simulator import StepSettings, StepStatus, simulate_step
 
 @dataclass(frozen=True)
 class Steps:
-    """How the n transitions of m particles settled; zero where one was not stepped."""
+    """How the n transitions of m particles settled; NaN (mode: zero) where one was
+    not stepped."""
 
     pose: Float[Tensor, "m n 3"]
     mode: Int[Tensor, "m n t"]

@@ -231,7 +231,7 @@ def _advance(state, variance, seen, k, size):
 def follow(state, theta, slopes, i, k, size):
     """Derivatives of the innovation and of the mean by theta, at a fixed gain (Gauss-Newton).
 
-    `theta` are those of the settled pose from a given start; after `_assimilate`.
+    `theta` are those of the settled pose from a given start; after `assimilate`.
     """
     by_theta, factor, gain = state.by_theta, state.factor, state.cross
     for e in range(theta.shape[0]):

@@ -71,13 +71,13 @@ def next_event(
         by_gap.append(own[:, None, :] + row[:, None, :] @ response.gap.mT)
         by_lever.append(row[:, None, :] @ response.lever.mT)
     margins, slopes = torch.cat(margin, -1), torch.cat(slope, -1)
-    # What is below zero by rounding changes here and now.
-    margins = margins - margins.detach().clamp_max(0.0)
+    # What is not above zero, by rounding, changes here and now, whatever moves.
+    margins = torch.where(margins.detach() > 0, margins, 0.0)
     falls = slopes < -SLOWEST * margins.detach()
     inverse = torch.where(falls, -1.0 / torch.where(falls, slopes, 1.0), 0.0)
     ahead = torch.where(falls, margins * inverse, torch.inf)
     first = ahead.detach().argmin(-1, keepdim=True)
-    inverse = inverse.gather(-1, first)
+    inverse = torch.where(margins.detach() > 0, inverse, 0.0).gather(-1, first)
 
     def derivative(parts: list[Tensor]) -> Tensor:
         values = torch.cat(parts, dim=1)

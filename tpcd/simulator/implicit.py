@@ -23,7 +23,7 @@ from tpcd.contact import ContactFrame, ContactScene, contact_frame
 from tpcd.planar import rotate
 from tpcd.simulator.record import ContactSet, StepSettings
 
-SINGULAR = 1e-12
+SINGULAR = 1e-9
 """Determinant over the product of the row sums below which loaded rows count as dependent."""
 
 

@@ -104,7 +104,7 @@ def step_element(
             start[a] = pose[a]
         follows, ended, left, now = 1.0 - share if rested else 0.0, CONVERGED, 0.0, 0
         fraction, point, terrain = first_touch(world, o, chains, start, part)
-        relaxed = False
+        relaxed, slid = False, False
         for a in range(3):
             landing[a] = start[a] + fraction * (part[a] - start[a])
             pose[a] = landing[a] if fraction < 1.0 else part[a]
@@ -130,6 +130,7 @@ def step_element(
                     loose = following in (LOOSE, FRICTIONLESS)
                     world.friction[o, t] = 0.0 if loose else space.friction[t]
                 attempt = following
+            slid = space.slid[0]
             relaxed = attempt == FRICTIONLESS
             if relaxed and ended == RELAXED:
                 status = JAMMED
@@ -138,7 +139,7 @@ def step_element(
         gone = share - done
         idle = stage != WALKING or request.finest == 1.0 or spent == MOST_SOUGHT
         fits = idle or gone <= least_part(kind, request.finest) * (1.0 + ALMOST)
-        fits = fits or ends_alike(modes, now, terrains)
+        fits = fits or ends_alike(modes, now, terrains, slid)
         if not idle and (kind == AIM or not fits):
             spent += 1
         seeks = (seeks or not fits) and spent < MOST_SOUGHT
@@ -176,7 +177,9 @@ def step_element(
                     event = NOTHING
             append_part(slopes, follows, space.force, space.right)
             touch = (point, terrain)
-            append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, space, slopes)
+            append_theta(
+                world, o, law, by_theta, moved, relaxed, touch, event, landing, pose, space, slopes
+            )
             if event[0] >= 0:
                 share += ahead
                 for a in range(3):
@@ -188,11 +191,11 @@ def step_element(
             modes, status, residual, stage = now, CONVERGED, 0.0, STRAIGHT
             _keep(slopes, pose, kept_pose, height, entries)
         elif stage == STRAIGHT:
-            parts = parts_of_path(request, command[2] - before[2], modes, now, terrains)
+            parts = parts_of_path(request, command[2] - before[2], modes, now, terrains, slid)
             if parts == 1:
                 break
             stage, straight, length = WALKING, status, 1.0 / parts
-            if request.finest < 1.0 and not ends_alike(modes, now, terrains):
+            if request.finest < 1.0 and not ends_alike(modes, now, terrains, slid):
                 seeks, kind, length = True, LOOK, GLANCE
             _restore(slopes, pose, kept_pose, height, entries)
             status, residual = CONVERGED, 0.0
@@ -227,7 +230,7 @@ def _after(attempt, first, ended, coulomb, lighter):
     may be wedged; itself where none does."""
     if attempt == PLAIN:
         return LOOSE if coulomb else FRICTIONLESS
-    if attempt == LOOSE and ended == CONVERGED:
+    if attempt == LOOSE and ended != RELAXED:
         return SLIPPING
     taken = attempt == SLIPPING and ended == CONVERGED and (lighter or first != CONVERGED)
     if attempt in (LOOSE, SLIPPING) and not taken:

@@ -2,7 +2,7 @@
 `events`.
 
 An event is (which, point, inverse): row 0-2 whose load comes to zero, or 3 + t where the point
-touches terrain t, and minus the inverse of the rate at which that load or gap falls.
+touches terrain t, and the inverse of the rate at which that load or gap falls.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def next_event(world, o, chains, law, before, command, pose, space, rate):
         slope = nx * rate[0] + nz * rate[1] + across * rate[2]
         if slope < -SLOWEST * margin and margin < -slope * ahead:
             ahead, which, point, inverse = -margin / slope, 3 + t, lowest, -1.0 / slope
-    return ahead, (which, point, inverse)
+    # What is not above zero, by rounding, changes here and now, whatever moves.
+    return ahead, (which, point, inverse if ahead > 0.0 else 0.0)
 
 
 @inner

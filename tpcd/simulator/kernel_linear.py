@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from typing import no_type_check
 
+from tpcd.simulator.implicit import SINGULAR
 from tpcd.simulator.kernel_geometry import object_normal
 from tpcd.simulator.kernel_inner import inner
 
@@ -73,7 +74,7 @@ def _invert(system):
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
     determinant = a * first + b * second + c * third
     scale = (abs(a) + abs(b) + abs(c)) * (abs(d) + abs(e) + abs(f)) * (abs(g) + abs(h) + abs(k))
-    if not abs(determinant) > 1e-12 * scale:
+    if not abs(determinant) > SINGULAR * scale:
         for j in range(3):
             for i in range(3):
                 system[9 + j, i] = 0.0

@@ -9,8 +9,8 @@ import numpy as np
 
 from tpcd.simulator.kernel_geometry import build_chains
 from tpcd.simulator.kernel_inner import inner
-from tpcd.simulator.kernel_settle import PROBE
 from tpcd.simulator.kernel_space import Law
+from tpcd.simulator.settle import PROBE_ANGLE
 
 
 class Request(NamedTuple):
@@ -90,7 +90,7 @@ def prepare(world, o, law, request, first, last, chains):
     if math.isfinite(extent):
         low, high = _angles(request, first, last)
         lean = 0.0 if law.coulomb else _largest(world.friction, o) * (high - low)
-        build_chains(world, o, low, high, 2.0 * PROBE + lean, chains)
+        build_chains(world, o, low, high, 2.0 * PROBE_ANGLE + lean, chains)
     return extent
 
 

@@ -18,12 +18,9 @@ from tpcd.simulator.kernel_geometry import lowest_point, object_normal
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system, respond
 from tpcd.simulator.kernel_space import LIST
+from tpcd.simulator.settle import NEWTON_ROUNDS, PROBE_ANGLE, SLIGHT
 from tpcd.simulator.wedge import PATIENCE
 
-NEWTON_ROUNDS = 6
-"""Rounds in which the Newton step on Coulomb's law is tried; later ones are plain fixed point."""
-PROBE = 0.02
-"""Rotation [rad] whose lowest points are candidates too, as in `settle`."""
 NEAR = 1e-4
 """A terrain further away than this is no candidate under Coulomb friction [m]."""
 CONVERGED, NOT_CONVERGED, RELAXED, INVALID = 0, 1, 2, 3
@@ -124,7 +121,7 @@ def _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, sp
             # gap + s mu slip of every point, which need not be least where the gap is.
             sign = 1.0 - 2.0 * side
             if k == 0:
-                du, dv = PROBE * sign * v, -PROBE * sign * u
+                du, dv = PROBE_ANGLE * sign * v, -PROBE_ANGLE * sign * u
             else:
                 slope = world.friction[o, t] * sign
                 du, dv = slope * (v - v_start), -slope * (u - u_start)
@@ -208,6 +205,7 @@ def _choose(world, o, law, pose, turn, space):
     for t in range(world.normals.shape[1]):
         space.before[t] = space.load[t]
         space.load[t] = 0.0
+    space.slid[0] = False
     for j in range(3):
         space.chosen[j, 0] = -1
         space.multiplier[j] = 0.0
@@ -224,7 +222,8 @@ def _choose(world, o, law, pose, turn, space):
             v * space.place[t, k, 0] - u * space.place[t, k, 1] - space.place[t, k, 2]
             + world.normals[o, t, 1] * pose[0] - world.normals[o, t, 0] * pose[1]
         )  # fmt: skip
-        space.slipping[j] = abs(slip) > 10.0 * law.tolerance
+        space.slipping[j] = abs(slip) > SLIGHT * law.tolerance
+        space.slid[0] = space.slid[0] or space.slipping[j]
     for j in range(3):
         if space.chosen[j, 0] < 0:
             continue

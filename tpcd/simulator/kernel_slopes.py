@@ -178,12 +178,15 @@ def append_part(slopes, follows, column, middle):
 
 @inner
 @no_type_check
-def append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, space, slopes):
+def append_theta(
+    world, o, law, by_theta, moved, relaxed, touch, event, landing, pose, space, slopes
+):  # fmt: skip
     """Append one settling to the derivatives of the whole step by theta.
 
-    `moved` is the element of `by_theta`, `touch` (point, terrain) of the first touch in the pose
-    `landing`, `event` (see `kernel_events`) what the settled pose is passed on to. At a given pose,
-    an entry of theta leaves a force on the balance and right-hand sides of the rows.
+    `moved` is the element of `by_theta`, `relaxed` says that friction was left out, `touch` (point,
+    terrain) of the first touch in the pose `landing`, `event` (see `kernel_events`) what the
+    settled pose is passed on to. At a given pose, an entry of theta leaves a force on the balance
+    and right-hand sides of the rows.
     """
     point, terrain = touch
     land, response, theta = slopes.land, slopes.response, slopes.theta
@@ -202,7 +205,7 @@ def append_theta(world, o, law, by_theta, moved, touch, event, landing, pose, sp
             x, z = by_theta.points[moved, e, 0, p], by_theta.points[moved, e, 1, p]
             height, along = u * x + v * z, v * x - u * z
             slope = space.side[j] * world.friction[o, t]
-            more = space.side[j] * by_theta.friction[moved, e, t]
+            more = 0.0 if relaxed else space.side[j] * by_theta.friction[moved, e, t]
             drag, more_drag = (0.0, 0.0) if law.coulomb and space.slipping[j] else (slope, more)
             at_x, at_z = space.place[t, k, 0], space.place[t, k, 1]
             slip = v * at_x - u * at_z + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]

@@ -33,8 +33,9 @@ class Space(NamedTuple):
     Rows of the contact problem, up to 2 t LIST of them: `rows`, `values`, `sizes`,
     `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The three
     rows that may carry load: `chosen` (3, 3) point (-1 where free), terrain and place,
-    `multiplier`, `side`, `slipping`. `system` (15, 3) as filled by `linear_system`. `friction`
-    keeps that of a jammed step while it is answered without.
+    `multiplier`, `side`, `slipping`; `slid` (1) whether one of them moved along its terrain.
+    `system` (15, 3) as filled by `linear_system`. `friction` keeps that of a jammed step while it
+    is answered without.
     """
 
     listed: np.ndarray
@@ -56,6 +57,7 @@ class Space(NamedTuple):
     multiplier: np.ndarray
     side: np.ndarray
     slipping: np.ndarray
+    slid: np.ndarray
     force: np.ndarray
     right: np.ndarray
     change: np.ndarray
@@ -89,6 +91,7 @@ def new_space(terrains):
         np.zeros(3),
         np.zeros(3),
         np.zeros(3, np.bool_),
+        np.zeros(1, np.bool_),
         np.empty(3),
         np.empty(3),
         np.empty(3),

@@ -16,27 +16,30 @@ from tpcd.simulator.walk import AIM, ALMOST, GLANCE, LOOK, SHY, TRY
 
 @njit(_nrt=False)
 @no_type_check
-def ends_alike(before, now, terrains):
+def ends_alike(before, now, terrains, slid):
     """Whether the end of a part does not depend on where on the way contact changed."""
     if now == before or now == 0:
         return True
-    loaded, loaded_before, slips = 0, 0, False
+    loaded, loaded_before, slips, same = 0, 0, False, True
     for t in range(terrains):
         mode, mode_before = now >> 2 * t & 3, before >> 2 * t & 3
         loaded += mode > 0
         loaded_before += mode_before > 0
         slips = slips or mode > 1 and mode_before > 0
+        same = same and (mode > 0) == (mode_before > 0)
+    if same and not slid:
+        return True
     return loaded == 1 and (loaded_before == 0 or loaded_before == 1 and slips)
 
 
 @njit(_nrt=False)
 @no_type_check
-def parts_of_path(request, turn, before, now, terrains):
+def parts_of_path(request, turn, before, now, terrains, slid):
     """Into how many parts the path is cut, after it was gone at once."""
     if request.substeps == 1:
         return 1
     parts = 1
-    if request.follow_path or not ends_alike(before, now, terrains):
+    if request.follow_path or not ends_alike(before, now, terrains, slid):
         parts = request.substeps
     if now != 0 or before != 0:
         parts = max(parts, math.ceil(abs(turn) / request.largest_turn - ALMOST))

@@ -14,7 +14,7 @@ from tpcd.simulator.events import next_event
 from tpcd.simulator.flight import Flight, first_touch, touch_row
 from tpcd.simulator.implicit import LinearResponse, linear_response, loaded_frames, newton_step
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus
-from tpcd.simulator.settle import Settled
+from tpcd.simulator.settle import Settled, slide
 from tpcd.simulator.wedge import settle
 
 GRAZING = 1e-9
@@ -33,6 +33,8 @@ class State:
     contacts: Tensor
     """Normal and tangential force [N] and arm of the contact point [m, m] of each terrain."""
     mode: Tensor
+    slid: Tensor
+    """Whether a loaded point moved along its terrain in the last part."""
     status: Tensor
     residual: Tensor
     ahead: Tensor
@@ -105,6 +107,7 @@ def start_state(scene: ContactScene, start: Tensor) -> State:
         from_lever=zeros,
         contacts=start.new_zeros(count, terrains, 4),
         mode=torch.zeros(count, terrains, dtype=torch.long, device=start.device),
+        slid=none > 0,
         status=none,
         residual=start.new_zeros(count),
         ahead=start.new_full((count,), torch.inf),
@@ -153,6 +156,7 @@ def advance(
         ),
         contacts=_contact_forces(scene, settled),
         mode=_contact_modes(settled, len(scene.terrains)),
+        slid=slide(scene, landing.detach(), settled.pose, settled.contacts, settings.tolerance),
         status=torch.maximum(state.status, settled.status),
         residual=torch.maximum(state.residual, settled.residual),
         ahead=ahead,

@@ -64,9 +64,9 @@ def follow_path(
     at_once = whole(path_start, command, rested)
     end = advance(scene, begin, at_once, stiffness, settings)
     turn = (command - path_start)[:, 2].detach()
-    parts = parts_of_path(settings, turn, begin.mode, end.mode)
+    parts = parts_of_path(settings, turn, begin.mode, end.mode, end.slid)
     if bool((parts > 1).any()):
-        seeks = ~ends_alike(begin.mode, end.mode)
+        seeks = ~ends_alike(begin.mode, end.mode, end.slid)
         walked = _walk(scene, begin, path_start, command, parts, seeks, rested, stiffness, settings)
         end = walked.where((parts > 1) & (walked.status <= end.status), end)
     return Transition(
@@ -111,7 +111,7 @@ def _walk(
         here = State(**{name: value[index] for name, value in vars(state).items()})
         there = advance(scene.gather(index), here, part, own(stiffness, index), settings)
         idle = (spent[index] == MOST_SOUGHT) | (settings.finest == 1)
-        fits = ends_alike(here.mode, there.mode) | idle
+        fits = ends_alike(here.mode, there.mode, there.slid) | idle
         fits = fits | (gone <= least_part(kind, settings.finest) * (1 + ALMOST))
         spent[index] += (~idle & ((kind == AIM) | ~fits)).long()
         seeks[index] = (seeks[index] | ~fits) & (spent[index] < MOST_SOUGHT)

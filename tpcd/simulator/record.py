@@ -7,6 +7,7 @@ the answer for each element of the batch.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
@@ -19,6 +20,8 @@ MAX_LOADED = 3
 
 LEAST_FINEST = 1e-6
 """Shorter parts cannot be told from rounding."""
+MOST_PARTS = 100_000
+"""Parts of equal length that a path may be cut into."""
 
 
 class StepStatus(IntEnum):
@@ -78,17 +81,21 @@ class StepSettings:
         """Refuse settings that mean nothing."""
         if self.friction not in ("coulomb", "anitescu"):
             raise ValueError(f"friction is {self.friction!r}, expected 'coulomb' or 'anitescu'")
-        if self.substeps < 1 or self.rounds < 1:
-            raise ValueError(
-                f"substeps {self.substeps} and rounds {self.rounds} must both be at least 1"
-            )
+        for name in ("substeps", "rounds"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or not 1 <= value <= MOST_PARTS:
+                raise ValueError(f"{name} is {value}, expected a whole number, 1 to {MOST_PARTS}")
         if not LEAST_FINEST <= self.finest <= 1:
             raise ValueError(f"finest is {self.finest}, expected a share of {LEAST_FINEST} to 1")
-        if not self.largest_turn > 0:
-            raise ValueError(f"largest_turn is {self.largest_turn}, expected radians above 0")
-        if self.compliance < 0 or self.tolerance <= 0:
+        least = 2 * math.pi / MOST_PARTS
+        if not self.largest_turn >= least:
             raise ValueError(
-                f"compliance {self.compliance} must be >= 0 and tolerance {self.tolerance} > 0"
+                f"largest_turn is {self.largest_turn}, expected radians from {least:.1g} on"
+            )
+        if not 0 <= self.compliance < math.inf or not 0 < self.tolerance < math.inf:
+            raise ValueError(
+                f"compliance {self.compliance} must be >= 0 and tolerance {self.tolerance} > 0, "
+                "both finite"
             )
 
 

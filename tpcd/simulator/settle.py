@@ -35,6 +35,8 @@ PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
 NEWTON_ROUNDS = 6
 """Rounds in which a Newton step on Coulomb's law is tried; later ones are plain fixed point."""
+SLIGHT = 10.0
+"""Times the tolerance, up to which a point has not moved along a terrain."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +231,7 @@ def _with_slip(
     One held by both its sides has not slipped. Where all of a terrain's load is at one edge of
     the friction cone, slip begins, however little it still is.
     """
-    now, before = (loaded_frames(scene, at, contacts) for at in (pose, start))
-    slip = ((now.points_world - before.points_world) * now.tangent).sum(-1)
+    slip = _slip(scene, start, pose, contacts)
     loaded = contacts.multiplier > 0
     beside = (contacts.terrain[:, :, None] == contacts.terrain[:, None, :]) & (
         loaded[:, :, None] & loaded[:, None, :]
@@ -238,8 +239,25 @@ def _with_slip(
     held = (beside & (contacts.point[:, :, None] == contacts.point[:, None, :])).sum(-1) > 1
     other_side = contacts.side[:, :, None] != contacts.side[:, None, :]
     one_sided = ~(beside & other_side).any(-1)
-    slips = one_sided | (slip.abs() > 10 * tolerance)
+    slips = one_sided | (slip.abs() > SLIGHT * tolerance)
     return replace(contacts, slipping=loaded & ~held & slips)
+
+
+def slide(
+    scene: ContactScene,
+    start: Float[Tensor, "b 3"],
+    pose: Float[Tensor, "b 3"],
+    contacts: ContactSet,
+    tolerance: float,
+) -> Bool[Tensor, " b"]:
+    """Whether a loaded point has moved along its terrain since the start."""
+    slip = _slip(scene, start, pose, contacts).abs()
+    return ((contacts.multiplier > 0) & (slip > SLIGHT * tolerance)).any(-1)
+
+
+def _slip(scene: ContactScene, start: Tensor, pose: Tensor, contacts: ContactSet) -> Tensor:
+    now, before = (loaded_frames(scene, at, contacts) for at in (pose, start))
+    return ((now.points_world - before.points_world) * now.tangent).sum(-1)
 
 
 def _motion(step: Tensor, extent: Tensor) -> Tensor:

@@ -43,10 +43,17 @@ def simulate_step(
 
     The batch axes of `scene`, `pose`, the commands and the stiffness are broadcast against each
     other. `stiffness` is the diagonal of K [N/m, N/m, N·m/rad]. Contact is solved in float64.
-    Raises ValueError for a stiffness that is not positive.
+    Raises ValueError for a stiffness that is not positive and finite, and for a pose or command
+    that has not three numbers.
     """
-    if stiffness.shape[-1:] != (3,) or not bool((stiffness > 0).all()):
-        raise ValueError(f"stiffness is {stiffness.tolist()}, expected three positive numbers")
+    right = (stiffness > 0) & torch.isfinite(stiffness)
+    if stiffness.shape[-1:] != (3,) or not bool(right.all()):
+        raise ValueError(
+            f"stiffness is {stiffness.tolist()}, expected three positive finite numbers"
+        )
+    for name, one in (("pose", pose), ("command", command), ("previous", previous)):
+        if one is not None and one.shape[-1:] != (3,):
+            raise ValueError(f"{name} has shape {tuple(one.shape)}, expected three numbers each")
     given = (pose, command, stiffness) if previous is None else (pose, command, stiffness, previous)
     batch = torch.broadcast_shapes(scene.batch_shape, *(one.shape[:-1] for one in given))
     if stiffness.ndim > 1:

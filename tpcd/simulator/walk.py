@@ -36,13 +36,20 @@ MOST_SOUGHT = 16
 taken as it is."""
 
 
-def ends_alike(before: Int[Tensor, "b t"], now: Int[Tensor, "b t"]) -> Bool[Tensor, " b"]:
+def ends_alike(
+    before: Int[Tensor, "b t"], now: Int[Tensor, "b t"], slid: Bool[Tensor, " b"]
+) -> Bool[Tensor, " b"]:
     """Whether the end of a part, with the `ContactMode` of each terrain `before` it and `now` at
-    its end, does not depend on where on the way contact changed."""
+    its end, does not depend on where on the way contact changed.
+
+    Where the same terrains are touched and no point has `slid`, modes are what the loads happen to
+    be: between two terrains the law leaves them open.
+    """
     loaded, loaded_before = (now > 0).sum(-1), (before > 0).sum(-1)
     slips = ((now > int(ContactMode.STICK)) & (before > 0)).any(-1)
     single = (loaded == 1) & ((loaded_before == 0) | ((loaded_before == 1) & slips))
-    return (now == before).all(-1) | (loaded == 0) | single
+    held = ((now > 0) == (before > 0)).all(-1) & ~slid
+    return (now == before).all(-1) | (loaded == 0) | single | held
 
 
 def parts_of_path(
@@ -50,12 +57,13 @@ def parts_of_path(
     turn: Float[Tensor, " b"],
     before: Int[Tensor, "b t"],
     now: Int[Tensor, "b t"],
+    slid: Bool[Tensor, " b"],
 ) -> Int[Tensor, " b"]:
     """Into how many parts the path is cut, once it was gone as a whole; the command turns by
     `turn` [rad]."""
     if settings.substeps == 1:
         return torch.ones_like(now[:, 0])
-    changes = ~ends_alike(before, now) | settings.follow_path
+    changes = ~ends_alike(before, now, slid) | settings.follow_path
     turns = (turn.abs() / settings.largest_turn - ALMOST).ceil()
     turns = torch.where((now > 0).any(-1) | (before > 0).any(-1), turns, 1.0).long()
     return torch.where(changes, settings.substeps, 1).maximum(turns)
@@ -101,7 +109,8 @@ def shorter_part(
 ) -> tuple[Int[Tensor, " b"], Float[Tensor, " b"]]:
     """Kind and length of the part in place of one of length `gone` on which contact changed.
 
-    `moving` tells whether contact is known for this direction, `ahead` where it changes next.
+    An expected change is closed in on down to `GLANCE`, whatever `finest` is. `moving` tells
+    whether contact is known for this direction, `ahead` where it changes next.
     """
     expected = (kind == TRY) & (SHY * ahead < gone)
     aims = (kind == AIM) | expected

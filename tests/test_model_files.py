@@ -50,7 +50,7 @@ FAULTS = {
     "a number": ("effects: [{name: floor_tilt, parameters: {angle: 3}}]", "is 3, expected [low"),
     "no mapping": ("effects: [{name: floor_tilt, parameters: 3}]", "expected 'name: [low, high]'"),
     "unknown step": ("step: {parts: 3}", "expected any of friction, substeps"),
-    "bad step": ("step: {substeps: 0}", "must both be at least 1"),
+    "bad step": ("step: {substeps: 0}", "substeps is 0, expected a whole number"),
     "no effects file": ("effects: [{name: a, file: nowhere.py}]", "nowhere.py: no such file"),
     "no EFFECTS": ("effects: [{name: a, file: empty.py}]", "empty.py: holds no EFFECTS"),
     "failing file": (

@@ -15,7 +15,7 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
-from tpcd.effects.catalogue import find_effect
+from tpcd.effects.catalogue import CATALOGUE, find_effect
 from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
@@ -52,6 +52,12 @@ def hovering(shape: PolygonShape, height: float, loaded: float = 0.0) -> Episode
     poses = commands.clone()
     poses[0, 1] += loaded / 1000.0
     return Episode(commands, poses, STIFFNESS * (poses - commands), STIFFNESS, NOISE)
+
+
+def first_row(shape: PolygonShape) -> Episode:
+    """The lowest point of the object at world z = 0, before any move."""
+    both = hovering(shape, 0.0)
+    return Episode(both.commands[:1], both.poses[:1], both.wrenches[:1], STIFFNESS, NOISE)
 
 
 def total(shape: PolygonShape, vectors: Tensor, history: History, **further) -> Tensor:
@@ -173,14 +179,42 @@ def test_effects_move_the_floor_there_as_elsewhere(shape: PolygonShape) -> None:
     assert flat - tilted > 10.0
 
 
+@pytest.mark.parametrize("effect", [effect.name for effect in CATALOGUE])
+def test_before_any_transition_any_effect_may_be_asked_for(
+    shape: PolygonShape, effect: str
+) -> None:
+    """Draws of the prior with it, which the start tells apart."""
+    settings = EstimatorSettings(misfit_sd=SD, effects=(find_effect(effect),))
+    belief = prior_belief(first_row(shape), shape, torch.Generator().manual_seed(0), settings)
+    assert torch.isfinite(belief.weights).all() and float(belief.weights.sum()) == pytest.approx(1)
+    assert float(belief.weights.min()) < 1e-6 * float(belief.weights.max())
+
+
+def test_before_any_transition_the_floor_may_be_tilted(shape: PolygonShape) -> None:
+    """Draws with a corner deep below the tilted floor are impossible, those clear of it alike."""
+    settings = EstimatorSettings(misfit_sd=SD, effects=(find_effect("floor_tilt"),))
+    start, away = first_row(shape), torch.tensor([-0.3, 0.0, 0.0])
+    start = replace(start, poses=start.poses + away, commands=start.commands + away)
+    belief = prior_belief(start, shape, torch.Generator().manual_seed(0), settings)
+    scene = scene_from_parameters(shape, belief.parameters)
+    x, z = (scene.points_ee + start.poses[0, :2]).unbind(-1)
+    tilt = belief.vectors[:, -1:]
+    floor = belief.parameters.floor_height
+    gap = (z * tilt.cos() - x * tilt.sin()).amin(-1) - floor * tilt[:, 0].cos()
+    flat = z.amin(-1) - floor
+    deep, clear = gap < -8e-3, gap > 8e-3
+    told = deep & (flat > 0)
+    assert int(told.sum()) > 5 and float(belief.weights[deep].sum()) < 1e-3
+    assert float(belief.weights[clear].max() - belief.weights[clear].median()) < 1e-4
+
+
 def test_before_any_transition_draws_are_weighted_by_it(shape: PolygonShape) -> None:
-    episode = hovering(shape, 0.0)
-    start = Episode(episode.commands[:1], episode.poses[:1], episode.wrenches[:1], STIFFNESS, NOISE)
+    start = first_row(shape)
     belief = prior_belief(
         start, shape, torch.Generator().manual_seed(0), EstimatorSettings(misfit_sd=SD)
     )
     scene = scene_from_parameters(shape, belief.parameters)
-    gap = (scene.points_ee[..., 1] + episode.poses[0, 1]).amin(-1) - belief.parameters.floor_height
+    gap = (scene.points_ee[..., 1] + start.poses[0, 1]).amin(-1) - belief.parameters.floor_height
     deep, clear = belief.weights[gap < -8e-3], belief.weights[gap > 8e-3]
     assert len(deep) > 20 and float(deep.sum()) < 1e-3
     assert float(clear.max() - clear.median()) < 1e-4

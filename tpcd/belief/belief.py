@@ -27,6 +27,7 @@ from tpcd.belief.cloud import (
 from tpcd.belief.free_start import rests_free, start_gaps
 from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
+from tpcd.belief.likelihood import effective_setting
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.resampling import weighted_quantile
@@ -191,9 +192,10 @@ def prior_belief(
     vectors, sd = prior.to_vector(score[:, :-1]), misfit.sd_of(score[:, -1])
     scene = scene_from_parameters(shape, prior.parameters_of(vectors)).double()
     history = history_of(episode)
-    starts = start_gaps(
-        scene.points_ee, history.setting(scene), history.poses[:, 2], torch.tensor([0])
-    )
+    setting, added = history.setting(scene), prior.added_of(vectors)
+    if added.effects:
+        setting, _ = effective_setting(scene, history, sd, misfit, settings.step, added)
+    starts = start_gaps(scene.points_ee, setting, history.poses[:, 2], torch.tensor([0]))
     free = starts.log_free_before(misfit, sd).exp()
     tells = bool(rests_free(history)[0]) and float(free.max()) > _SOME_FREE
     weights = free if tells else torch.ones_like(free)

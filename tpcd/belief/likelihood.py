@@ -143,7 +143,7 @@ def outcome_of(
     stepped = used & steps.contacts.isfinite().all(-1).all(-1)
     pose[:, 1:] = torch.where(stepped[..., None], steps.pose, pose[:, 1:])
     mode, contacts = (
-        torch.cat((torch.zeros_like(value[:, :1]), value), dim=1)
+        torch.cat((value.new_zeros(m, 1, *value.shape[2:]), value), dim=1)
         for value in (steps.mode, steps.contacts.nan_to_num(0.0))
     )
     whether = torch.full(pose.shape[:2], first, device=pose.device)

@@ -111,7 +111,7 @@ def _grasp_slip(
 ) -> Conditions:
     angle, shift, at = (column(values, i) for i in range(3))
     # A step over one row, linear in between so that its place has a slope.
-    spacing = rows.share.diff().clamp_min(0.0).max().clamp_min(1e-9)
+    spacing = torch.nn.functional.pad(rows.share.diff(), (0, 1), value=1e-9).max()
     done = ((rows.share - at) / spacing + 1.0).clamp(0.0, 1.0)
     turn = conditions.command[..., 2]
     way = (shift * done)[..., None] * torch.stack((turn.cos(), turn.sin()), dim=-1)

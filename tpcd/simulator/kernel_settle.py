@@ -18,7 +18,8 @@ from tpcd.simulator.kernel_geometry import lowest_point, object_normal
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system, respond
 from tpcd.simulator.kernel_space import LIST
-from tpcd.simulator.settle import NEWTON_ROUNDS, PROBE_ANGLE, SLIGHT
+from tpcd.simulator.loaded import SLIGHT
+from tpcd.simulator.settle import NEWTON_ROUNDS, PROBE_ANGLE
 from tpcd.simulator.wedge import PATIENCE
 
 NEAR = 1e-4

@@ -13,8 +13,9 @@ from tpcd.contact import ContactScene
 from tpcd.simulator.events import next_event
 from tpcd.simulator.flight import Flight, first_touch, touch_row
 from tpcd.simulator.implicit import LinearResponse, linear_response, loaded_frames, newton_step
+from tpcd.simulator.loaded import slide
 from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus
-from tpcd.simulator.settle import Settled, slide
+from tpcd.simulator.settle import Settled
 from tpcd.simulator.wedge import settle
 
 GRAZING = 1e-9

@@ -27,7 +27,14 @@ from torch import Tensor
 
 from tpcd.contact import ContactScene, contact_frame
 from tpcd.qp import ContactQP, Status, solve
-from tpcd.simulator.implicit import loaded_frames, newton_step
+from tpcd.simulator.implicit import newton_step
+from tpcd.simulator.loaded import (
+    no_contacts,
+    put_contacts,
+    take_contacts,
+    terrain_load,
+    with_slip,
+)
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.record import MAX_LOADED, ContactSet, StepSettings, StepStatus
 
@@ -35,8 +42,6 @@ PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
 NEWTON_ROUNDS = 6
 """Rounds in which a Newton step on Coulomb's law is tried; later ones are plain fixed point."""
-SLIGHT = 10.0
-"""Times the tolerance, up to which a point has not moved along a terrain."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def settle_from(
     pose = (start if sought is None else sought.pose).clone()
     residual = torch.full_like(start[:, 0], torch.inf)
     status = torch.full((count,), int(StepStatus.NOT_CONVERGED), device=device)
-    contacts = _no_contacts(count, start) if sought is None else sought.contacts
+    contacts = no_contacts(count, start) if sought is None else sought.contacts
     load = start.new_zeros(count, terrains)
     extent = scene.points_ee.norm(dim=-1).amax(-1)
     running = torch.arange(count, device=device)
@@ -91,7 +96,7 @@ def settle_from(
             rows, command[running] - pose[running], own(stiffness, running)
         )
         after = pose[running] + step
-        found = _with_slip(part, start[running], after, found, settings.tolerance)
+        found = with_slip(part, start[running], after, found, settings.tolerance)
         put_contacts(contacts, running, found)
         loaded_now = terrain_load(found, terrains)
         sinking = settings.compliance * (loaded_now - load[running]).abs().amax(-1)
@@ -223,69 +228,6 @@ def _solve_rows(
     return solution.motion, contacts, solution.status == int(Status.RELAXED)
 
 
-def _with_slip(
-    scene: ContactScene, start: Tensor, pose: Tensor, contacts: ContactSet, tolerance: float
-) -> ContactSet:
-    """Mark the loaded rows whose point slips.
-
-    One held by both its sides has not slipped. Where all of a terrain's load is at one edge of
-    the friction cone, slip begins, however little it still is.
-    """
-    slip = _slip(scene, start, pose, contacts)
-    loaded = contacts.multiplier > 0
-    beside = (contacts.terrain[:, :, None] == contacts.terrain[:, None, :]) & (
-        loaded[:, :, None] & loaded[:, None, :]
-    )
-    held = (beside & (contacts.point[:, :, None] == contacts.point[:, None, :])).sum(-1) > 1
-    other_side = contacts.side[:, :, None] != contacts.side[:, None, :]
-    one_sided = ~(beside & other_side).any(-1)
-    slips = one_sided | (slip.abs() > SLIGHT * tolerance)
-    return replace(contacts, slipping=loaded & ~held & slips)
-
-
-def slide(
-    scene: ContactScene,
-    start: Float[Tensor, "b 3"],
-    pose: Float[Tensor, "b 3"],
-    contacts: ContactSet,
-    tolerance: float,
-) -> Bool[Tensor, " b"]:
-    """Whether a loaded point has moved along its terrain since the start."""
-    slip = _slip(scene, start, pose, contacts).abs()
-    return ((contacts.multiplier > 0) & (slip > SLIGHT * tolerance)).any(-1)
-
-
-def _slip(scene: ContactScene, start: Tensor, pose: Tensor, contacts: ContactSet) -> Tensor:
-    now, before = (loaded_frames(scene, at, contacts) for at in (pose, start))
-    return ((now.points_world - before.points_world) * now.tangent).sum(-1)
-
-
 def _motion(step: Tensor, extent: Tensor) -> Tensor:
     """Largest motion of any point of the object under a small pose change [m]."""
     return step[:, :2].abs().amax(-1) + step[:, 2].abs() * extent
-
-
-def terrain_load(contacts: ContactSet, terrains: int) -> Float[Tensor, "b t"]:
-    """Normal force on each terrain [N]: every row of a contact pushes with its multiplier."""
-    load = contacts.multiplier.new_zeros(len(contacts.multiplier), terrains)
-    return load.scatter_add(1, contacts.terrain, contacts.multiplier)
-
-
-def _no_contacts(count: int, like: Tensor) -> ContactSet:
-    zeros = like.new_zeros(count, MAX_LOADED)
-    index = torch.zeros(count, MAX_LOADED, dtype=torch.long, device=like.device)
-    return ContactSet(zeros, index, index.clone(), zeros.clone(), index.bool())
-
-
-def take_contacts(contacts: ContactSet, index: Int[Tensor, " i"]) -> ContactSet:
-    """Those of some elements."""
-    return ContactSet(*(getattr(contacts, name)[index] for name in _CONTACT_FIELDS))
-
-
-def put_contacts(contacts: ContactSet, index: Int[Tensor, " i"], values: ContactSet) -> None:
-    """Overwrite those of some elements, in place."""
-    for name in _CONTACT_FIELDS:
-        getattr(contacts, name)[index] = getattr(values, name)
-
-
-_CONTACT_FIELDS = ("multiplier", "point", "terrain", "side", "slipping")

@@ -18,16 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.contact import ContactScene
+from tpcd.simulator.loaded import put_contacts, take_contacts, terrain_load
 from tpcd.simulator.record import StepSettings, StepStatus
-from tpcd.simulator.settle import (
-    Settled,
-    own,
-    put_contacts,
-    settle_from,
-    take_contacts,
-    terrain_load,
-    without_friction,
-)
+from tpcd.simulator.settle import Settled, own, settle_from, without_friction
 
 PATIENCE = 3
 """Times as many rounds from the pose without friction."""

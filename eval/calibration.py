@@ -2,18 +2,10 @@
 
 Each run draws theta from the prior, an episode given theta, and asks where theta lies in the
 posterior: its place u = P(entry < true entry | data) is uniform when the posterior is right.
-
-What is exact with the default estimator: the data come from the likelihood's own model. Each
-transition starts at the true pose of the row before and settles against terrains that are
-further away by the misfit, of which each run has one field and one size; what the field's
-slope does to the lever is linear. Pose and wrench are measured with noise.
-Commands depend on earlier measurements only (tpcd/truth/motions.py), which no posterior
-minds, and the start pose is drawn without regard to theta and misfit, as long as the object is
-free there, which the likelihood knows, and near the floor, which the first data say. What is
-not exact: the filter's linearisation in the start pose and in what is not known of the misfit
-yet; a misfit so large that the angle at which it is read does not settle (some centimetres;
-keep `--misfit` to millimetres); the robust treatment of outliers and of bad parity, which
-concerns about 1 datum in 1000 each. With `--estimator paper` the data are
+`eval/drawn.py` says how exactly the episodes come from the likelihood's own model. The default
+estimator takes that likelihood to a power below 1, so the exact posterior would be too wide:
+what is asked is whether that and the sampler together hold what they say.
+With `--estimator paper` the data are
 the same, while that filter assumes another noise: its ranks show what this costs.
 
 python -m eval.calibration --runs 200 --steps 10 --out runs/calibration
@@ -30,24 +22,13 @@ from eval.lines import append_lines, read_lines, write_line
 from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
-    import torch
     from matplotlib.figure import Figure
 
-    from tpcd.belief.belief import EstimatorSettings
-    from tpcd.belief.prior import ParameterPrior
-    from tpcd.data.episode import Episode
     from tpcd.shape.protocol import Shape
 
 COMMAND = "python -m eval.calibration"
 RUNS_FILE = "runs.jsonl"
 BINS = 10
-ANGLE_ROUNDS = 30
-"""Rounds, each of half a step, in which the angle at which the misfit is read settles."""
-LEFTMOST_START = 0.12
-HIGHEST_START = 0.20
-"""Start poses lie so far left of the origin, and over the lowest floor, at most [m]."""
-LARGEST_GAP = 0.02
-"""Distance from the floor at the start at most [m]: it is met within two steps."""
 
 
 @dataclass(frozen=True)
@@ -120,89 +101,6 @@ def calibrate(config: Calibration) -> None:
     write_results(folder, table, seeds=sorted(done), runs=len(places), failed=failed)
 
 
-def draw_episode(
-    prior: ParameterPrior,
-    settings: EstimatorSettings,
-    steps: int,
-    generator: torch.Generator,
-) -> tuple[torch.Tensor, Episode]:
-    """Theta and the size of the misfit (d + 1) from the prior, and an episode given both."""
-    import torch
-
-    from tpcd.belief.belief import misfit_field
-    from tpcd.contact import scene_from_parameters, terrain_gaps
-    from tpcd.data.episode import Episode
-    from tpcd.simulator import simulate_step
-    from tpcd.truth.motions import History, rich_exploration
-    from tpcd.truth.recording import DEFAULT_SENSOR_STD
-    from tpcd.truth.scene import DEFAULT_STIFFNESS
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    # A start pose drawn without regard to theta says something about theta all the same: the
-    # object is free there. The likelihood knows that, so all of it is drawn until it is.
-    start = torch.zeros(3, dtype=torch.float64)
-    field = misfit_field(prior.shape, settings)
-    low, high = (edge[prior.names.index("floor_height")] for edge in (prior.low, prior.high))
-    while True:
-        score = prior.sample(1, generator)
-        scene = scene_from_parameters(prior.shape, prior.to_parameters(score[0]))
-        terrains = len(scene.terrains)
-        misfit_sd = field.sd_of(normal(1))[0]
-        coefficients = misfit_sd * normal(field.bumps * terrains)
-        draw = torch.rand(2, generator=generator, dtype=torch.float64)
-        start[0] = -LEFTMOST_START * draw[0]
-        start[1] = low + draw[1] * (high - low + HIGHEST_START)
-        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
-        floor_gap, wall_gap = gaps.amin(-1) + field.gap(coefficients, start[2])
-        if 0 < floor_gap < LARGEST_GAP and wall_gap > 0:
-            break
-    vector = prior.to_vector(score)[0]
-    stiffness = torch.tensor(DEFAULT_STIFFNESS, dtype=torch.float64)
-    sensor_std = torch.tensor(DEFAULT_SENSOR_STD, dtype=torch.float64)
-    # `history_of` adds what any simulator's numerics leave to the noise of the poses.
-    pose_std = (sensor_std[:3] ** 2 + 2e-5**2).sqrt()
-    wrench_variance = (sensor_std[3:] ** 2 + 2e-5**2) / stiffness**2
-    weight = pose_std**2 / (pose_std**2 + wrench_variance)
-
-    motion = rich_exploration(generator)
-    settled = start
-    commands = settled[None].clone()
-    poses = (settled + pose_std * normal(3))[None]
-    wrenches = (sensor_std[3:] * normal(3))[None]
-    for _ in range(steps):
-        command = motion.next_command(History(commands, poses, wrenches, stiffness))
-        noise = pose_std * normal(3)
-        wrench_noise = sensor_std[3:] * normal(3) / stiffness
-        # The likelihood reads the field at the estimated angle, which the field itself moves.
-        error = noise + weight * (wrench_noise - noise)
-        uncovered = misfit_sd * normal(terrains)
-        angle = settled[2]
-        for _ in range(ANGLE_ROUNDS):
-            value, slope = field.basis(angle)
-            gap = field.gap(coefficients, angle)
-            gap = gap + (1 - (value**2).sum()).clamp_min(0.0).sqrt() * uncovered
-            there = simulate_step(
-                scene.further(gap),
-                settled,
-                command,
-                stiffness,
-                settings.step,
-                previous=commands[-1],
-            )
-            lever = coefficients.reshape(terrains, -1) @ slope
-            pose = there.pose + (there.pose_from_lever * lever[:, None]).sum(0)
-            angle = 0.5 * (angle + (pose + error)[2])
-        settled = pose
-        commands = torch.cat((commands, command[None]))
-        poses = torch.cat((poses, (settled + noise)[None]))
-        wrench = stiffness * (settled + wrench_noise - command)
-        wrenches = torch.cat((wrenches, wrench[None]))
-    truth = torch.cat((vector, misfit_sd[None]))
-    return truth, Episode(commands, poses, wrenches, stiffness, sensor_std, object="drawn")
-
-
 def coverage_table(places: Sequence[Sequence[float]], names: Sequence[str]) -> list[dict[str, Any]]:
     """Coverage of central 50 and 90 % intervals, with 95 % binomial limits, and the p-value of
     a chi-square test of uniform ranks, for each parameter."""
@@ -252,10 +150,10 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     """Places of the true entries in their posterior, or why there are none."""
     import torch
 
-    from tpcd.belief.belief import EstimatorSettings
-    from tpcd.belief.cloud import SamplerSettings
+    from eval.drawn import draw_episode
     from tpcd.belief.paper import PaperSettings
     from tpcd.belief.prior import make_prior
+    from tpcd.belief.settings import EstimatorSettings, SamplerSettings
     from tpcd.exploration import Estimator
 
     few = {"default": 300, "paper": 1000} if config.quick else {"default": 700, "paper": 5000}

@@ -22,7 +22,7 @@ SESSIONS = ("expert", "test", "diagnosis")
 
 def recorded(config: Physical, index: int, folder: Path) -> dict[str, Episode]:
     """The sessions of an object: read where they are, else driven through the emulator."""
-    from tpcd.data.episode import read_episode, write_episode
+    from tpcd.data.files import read_episode, write_episode
     from tpcd.robot.emulator import EmulatorSettings
     from tpcd.robot.emulator.process import running_emulator
 

@@ -96,7 +96,7 @@ def import_recording(config: LogImport) -> int:
     """
     import sys
 
-    from tpcd.data.episode import write_together
+    from tpcd.data.files import write_together
     from tpcd.figures.imported_log import imported_log
     from tpcd.figures.sinks import save_figure
     from tpcd.logs.importing import Importing, import_log

@@ -38,6 +38,8 @@ class Predict:
 
 def predict_episodes(config: Predict) -> None:
     """Predict every row of the episodes from the row before and print error and coverage."""
+    import sys
+
     import torch
 
     from tpcd.belief.augmented import with_model
@@ -48,6 +50,7 @@ def predict_episodes(config: Predict) -> None:
         measured_rows,
         predict_rows,
         rollout_rows,
+        run_warnings,
         score_rows,
         write_prediction,
     )
@@ -58,10 +61,13 @@ def predict_episodes(config: Predict) -> None:
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
-    check_target(config.out, config.overwrite)
     episodes = [read_episode(path) for path in config.episodes]
+    read = [episode.path for episode in episodes if episode.path is not None]
+    check_target(config.out, config.overwrite, read)
     model = model_of(config.model)
     belief = load_belief(config.run)
+    for warning in run_warnings(config.run, episodes):
+        print(f"warning: {warning}", file=sys.stderr)
     for path, episode in zip(config.episodes, episodes, strict=True):
         if not torch.allclose(episode.stiffness, belief.stiffness):
             raise RunError(

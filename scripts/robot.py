@@ -112,14 +112,19 @@ def explore_with_robot(config: Experiment) -> None:
 
     from tpcd.commands.exploring import EPISODE_NAME, Stage, explore_in_folder
     from tpcd.commands.exploring import MAY_CHANGE as ALWAYS
-    from tpcd.data.episode import episode_contents
+    from tpcd.data.files import episode_contents
     from tpcd.robot.ur import FRAME_FILE, UniversalRobot
 
     torch.set_num_threads(1)
     settings = _settings(config)
     commands = None if config.commands is None else _commands(config.commands)
     if commands is not None:
-        config = replace(config, steps=min(config.steps, len(commands) - 1))
+        planned = len(commands) - 1
+        if config.steps < planned:
+            print(
+                f"{config.steps} of the {planned} moves planned are made; --steps {planned} is all"
+            )
+        config = replace(config, steps=min(config.steps, planned))
 
     def stage(folder: Path, limits: Limits, task: Task | None) -> Stage:
         robot = UniversalRobot(settings, folder / "raw", lambda text: _confirmed(config, text))

@@ -129,7 +129,7 @@ def simulate(config: Simulation) -> None:
     """Simulate episodes of an object in the hand that touches a floor and a wall."""
     import torch
 
-    from tpcd.data.episode import write_together
+    from tpcd.data.files import write_together
     from tpcd.files import to_plain
     from tpcd.parameters import SCENE_NAMES
     from tpcd.random import stream

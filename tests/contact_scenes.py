@@ -12,7 +12,8 @@ from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.contact import ContactScene, place_points, scene_from_parameters
 from tpcd.parameters import Parameters
 from tpcd.planar import transform_points
-from tpcd.shape.builtin import ENTRIES, builtin_outlines, make_entry
+from tpcd.shape.builtin import builtin_outlines, make_entry
+from tpcd.shape.household import ENTRIES
 from tpcd.shape.polygon import PolygonShape
 from tpcd.terrain import floor, wall
 

@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.belief import EstimatorSettings, prior_belief
+from tpcd.belief.belief import prior_belief
 from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History, history_of, joined_history
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
+from tpcd.belief.settings import EstimatorSettings
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.effects.catalogue import CATALOGUE, find_effect

@@ -6,13 +6,14 @@ import math
 
 import pytest
 import torch
-from linear_model import DIMENSION, LinearModel
+from linear_model import DIMENSION, LinearModel, LinearTarget
 from torch import Tensor
 
-from tpcd.belief.cloud import Cloud, SamplerSettings, start_cloud
-from tpcd.belief.importance import assimilate, draw_pool
+from tpcd.belief.cloud import Cloud, start_cloud
+from tpcd.belief.importance import assimilate, draw_pool, spread_choice
 from tpcd.belief.pool import Proposal, cut_off, truncate, weigh
 from tpcd.belief.proposals import DAMPINGS, curved_mixture
+from tpcd.belief.settings import SamplerSettings
 
 SETTINGS = SamplerSettings(particles=2000, draws=6000)
 FEW = SamplerSettings(particles=500, places=20, fresh_modes=20, modes=5)
@@ -159,16 +160,24 @@ def test_an_uninformative_datum_gives_the_prior_back() -> None:
     torch.testing.assert_close(spread, torch.ones(DIMENSION).double(), atol=0.15, rtol=0)
 
 
-def test_dampings_share_out_the_draws_by_what_they_were_worth() -> None:
-    model = LinearModel(3)
-    for rounds in (1, 4):
-        settings = SamplerSettings(rounds=rounds, draws=500)
-        generator = torch.Generator().manual_seed(0)
-        pool = draw_pool(start(), model.target(3), 1, settings, generator)
-        assert float(pool.shares.sum()) == pytest.approx(1.0)
-        assert (pool.shares > 0).all()
-        # A normal posterior needs no damping at all.
-        assert int(pool.shares.argmax()) <= 1
+@pytest.mark.parametrize(("known", "best"), [(1.0, 0), (0.1, len(DAMPINGS) - 1)])
+def test_dampings_share_out_the_draws_by_what_they_were_worth(known: float, best: int) -> None:
+    """A normal posterior needs no damping; of ten times its variance it needs the strongest."""
+
+    class Flat(LinearTarget):
+        def curvature(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            gradient, information = super().curvature(x)
+            return gradient, known * information
+
+    given = LinearModel(3).target(3)
+    target = Flat(given.model, given.count, given.likelihood)
+    settings = SamplerSettings(rounds=1, draws=500)
+    for seed in range(5):
+        generator = torch.Generator().manual_seed(seed)
+        shares = draw_pool(start(), target, 1, settings, generator).shares
+        assert float(shares.sum()) == pytest.approx(1.0)
+        assert (shares > 0).all()
+        assert int(shares.argmax()) == best
 
 
 def test_few_heavy_draws_are_made_equal_but_a_single_one_is_kept() -> None:
@@ -216,6 +225,19 @@ def test_weights_that_are_cut_off_sum_to_one_and_none_dominates() -> None:
     assert found[5] == 0
     even = torch.full((100,), 0.01, dtype=torch.float64)
     torch.testing.assert_close(cut_off(even, 10.0), even)
+    with pytest.raises(ValueError, match="expected less than the 99 weights above zero"):
+        cut_off(weights, 100.0)
+
+
+@pytest.mark.parametrize("count", [150, 20_000])
+def test_places_are_chosen_by_weight_however_few_draws_there_are(count: int) -> None:
+    """Ten draws hold most of the weight: each may be chosen ten times as often as if all were
+    alike, or 300 places have to be chosen."""
+    log_weights = torch.full((count,), -9.0, dtype=torch.float64)
+    log_weights[:10] = 0.0
+    chosen = spread_choice(log_weights, 4000, torch.Generator().manual_seed(0))
+    share = 10 * max(10 / count, 1 / 300)
+    assert float((chosen < 10).double().mean()) == pytest.approx(share, rel=0.25)
 
 
 def test_evidence_is_not_biased_by_the_places_chosen() -> None:

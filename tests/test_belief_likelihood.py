@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.belief import EstimatorSettings, estimate
-from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.belief import estimate
 from tpcd.belief.compiled import compiled_filter
 from tpcd.belief.filtered import HistoryLikelihood, filter_history
 from tpcd.belief.free_start import free_starts, start_gaps
@@ -19,6 +18,7 @@ from tpcd.belief.likelihood import effective_setting, highest_terms, history_lik
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.belief.setting import PARITY_LIMIT
+from tpcd.belief.settings import EstimatorSettings, SamplerSettings
 from tpcd.contact import ContactScene, scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.effects.catalogue import find_effect

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import CURVATURE_COST, Counted, SamplerSettings, start_cloud
+from tpcd.belief.cloud import CURVATURE_COST, Counted, start_cloud
 from tpcd.belief.importance import draw_pool
 from tpcd.belief.modes import climb, climb_with_the_best, find_modes, log_target, set_out
+from tpcd.belief.settings import SamplerSettings
 
 DIMENSION = 2
 CENTRES = torch.tensor([[2.0, 0.0], [-2.0, 1.0], [0.0, -3.0]], dtype=torch.float64)

@@ -13,11 +13,13 @@ from linear_model import DIMENSION, LinearModel
 from short_episode import short_episode
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, refine
-from tpcd.belief.belief import EstimationStep
+from tpcd.belief.belief import EstimationStep, target_of
 from tpcd.belief.cloud import start_cloud
+from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
 from tpcd.belief.state import load_state
 from tpcd.belief.storage import load_belief
+from tpcd.belief.target import ContactTarget
 from tpcd.commands.estimation import run_estimation
 from tpcd.data.episode import Episode
 from tpcd.effects import find_effect
@@ -25,7 +27,10 @@ from tpcd.exploration import Estimator
 from tpcd.shape.checkpoint import load_prior
 
 PRIOR, STEPS = "ycb21-z2", 4
-SETTINGS = EstimatorSettings(sampler=SamplerSettings(particles=64, draws=600, closing=5))
+SETTINGS = EstimatorSettings(
+    sampler=SamplerSettings(particles=64, draws=600),
+    closing=SamplerSettings(places=300, draws=3000, modes=60, fresh_modes=200),
+)
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +63,40 @@ def test_the_same_data_again_count_once() -> None:
     assert abs(cloud.log_evidence - log_evidence) < 4 * cloud.log_evidence_std
 
 
-def test_the_closing_budget_multiplies_all_that_finds_places() -> None:
-    given = SamplerSettings(places=7, draws=110, modes=3, fresh_modes=11, closing=5)
-    wanted = replace(given, places=35, draws=550, modes=15, fresh_modes=55)
-    assert EstimatorSettings(sampler=given).closing_budget == wanted
-    effect = EstimatorSettings(sampler=given, effects=(find_effect("adhesion"),))
-    assert effect.closing_budget == replace(wanted, draws=1650)
+def test_the_closing_budget_has_the_particles_of_the_other_and_more_draws_for_effects() -> None:
+    closing = SamplerSettings(particles=700, places=35, draws=550, modes=15, fresh_modes=55)
+    given = EstimatorSettings(sampler=SamplerSettings(particles=40, draws=110), closing=closing)
+    assert given.closing_budget == replace(closing, particles=40)
+    assert given.budget.draws == 110
+    effect = replace(given, effects=(find_effect("adhesion"),))
+    assert effect.closing_budget == replace(closing, particles=40, draws=1650)
+    assert effect.budget.draws == 330
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("power", 0.0, "more than 0 and at most 1"),
+        ("power", 1.5, "more than 0 and at most 1"),
+        ("power", math.nan, "more than 0 and at most 1"),
+        ("closing_passes", 0, "at least 1"),
+        ("closing_worth", math.nan, "at least 0"),
+    ],
+)
+def test_settings_without_meaning_are_refused(name: str, value: float, expected: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is .*, expected {expected}"):
+        EstimatorSettings(**{name: value})
+
+
+def test_the_likelihood_counts_to_its_power(episode: Episode, estimator: Estimator) -> None:
+    def target(power: float) -> ContactTarget:
+        settings = replace(SETTINGS, power=power)
+        return target_of(episode, estimator.shape, settings).given(history_of(episode))
+
+    score = target(1.0).sample(20, torch.Generator().manual_seed(5))
+    whole = target(1.0).log_likelihood(score, None)
+    assert whole.isfinite().any()
+    torch.testing.assert_close(target(0.6).log_likelihood(score, None), 0.6 * whole)
 
 
 def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(
@@ -88,8 +121,8 @@ def test_it_draws_again_while_too_few_draws_count(
     episode: Episode, estimator: Estimator, steps: list[EstimationStep]
 ) -> None:
     def closed(passes: int, worth: float) -> EstimationStep:
-        sampler = replace(SETTINGS.sampler, closing_passes=passes, closing_worth=worth)
-        return refine(episode, estimator.shape, steps[-1].state, replace(SETTINGS, sampler=sampler))
+        settings = replace(SETTINGS, closing_passes=passes, closing_worth=worth)
+        return refine(episode, estimator.shape, steps[-1].state, settings)
 
     never = math.inf
     one, two, three = (closed(passes, never) for passes in (1, 2, 3))

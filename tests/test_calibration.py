@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from eval.calibration import Calibration, calibrate, coverage_table, draw_episode
+from eval.calibration import Calibration, calibrate, coverage_table
+from eval.drawn import draw_episode
 from eval.lines import append_lines, read_lines, write_line
-from tpcd.belief.belief import EstimatorSettings, misfit_field
+from tpcd.belief.belief import misfit_field
 from tpcd.belief.history import history_of
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.prior import make_prior
+from tpcd.belief.settings import EstimatorSettings
 from tpcd.errors import RunError
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines

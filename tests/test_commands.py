@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 from command_calls import PRIOR, call, make_world
 
 from tpcd.belief.storage import load_belief
-from tpcd.data import read_episode
+from tpcd.data import read_episode, write_episode
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +74,23 @@ def test_predictions_have_a_row_for_each_step(
             assert float(row[f"{name}_sd"]) > 0
     printed = capsys.readouterr().out
     assert "coverage_90" in printed and "mae" in printed
+
+
+def test_predictions_of_a_stopped_run_or_an_inverted_sensor_are_warned_of(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(world / "run", tmp_path / "run")
+    episode = read_episode(world / "explore.csv")
+    write_episode(replace(episode, wrenches=-episode.wrenches), tmp_path / "upside_down.csv")
+
+    def told(file: Path, out: str) -> str:
+        call("predict", str(tmp_path / "run"), str(file), "--out", str(tmp_path / out))
+        return capsys.readouterr().err
+
+    assert "warning" not in told(world / "explore.csv", "whole.csv")
+    assert "upside_down.csv: F_z looks inverted" in told(tmp_path / "upside_down.csv", "wrong.csv")
+    (tmp_path / "run" / "results.json").unlink()
+    assert "was stopped before its last row" in told(world / "explore.csv", "part.csv")
 
 
 def test_nothing_is_overwritten_silently(

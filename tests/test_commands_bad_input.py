@@ -142,7 +142,8 @@ PREDICT = {
     "no belief": (("episodes",), {}, "belief.json: no such file"),
     "no particles": (("run",), {"--particles": "0"}, "particles is 0, expected at least 1"),
     "folder in the way": (("run",), {"--out": "run"}, "run: is a folder"),
-    "file in the way": (("run",), {"--out": "test.csv"}, "test.csv: exists already"),
+    "file in the way": (("run",), {"--out": "run/belief.json"}, "run/belief.json: exists already"),
+    "its own input": (("run",), {"--out": "test.csv"}, "test.csv: is what the command reads"),
     "below a file": (("run",), {"--out": "test.csv/p.csv"}, "test.csv is a file"),
     "misspelt choice": (("run",), {"--of": "treu"}, "found 'treu', expected one of"),
 }

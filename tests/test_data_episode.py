@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from tpcd.data import Episode, check_episode, read_episode, write_episode
 from tpcd.data.checks import LARGEST_WRENCH
-from tpcd.data.episode import write_together
+from tpcd.data.files import write_together
 from tpcd.errors import EpisodeError
 
 HEADER = "step,u_x,u_z,u_phi,x,z,phi,F_x,F_z,tau"
@@ -328,5 +328,8 @@ def test_an_inverted_wrench_is_a_warning_and_a_right_one_is_none(tmp_path):
     assert "check the stiffness" in warning
     free = replace(episode, poses=commands, wrenches=noise)
     assert "no step shows contact" in check_episode(free)[0]
+    for factor in (1e-3, 1e-2):
+        soft = check_episode(replace(episode, stiffness=stiffness * factor))
+        assert any("K (pose - command) stays within the noise" in line for line in soft)
     silent = replace(episode, sensor_std=torch.zeros(6, dtype=torch.float64))
     assert any("taken as free of noise" in line for line in check_episode(silent))

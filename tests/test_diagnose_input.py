@@ -15,7 +15,7 @@ from made_logs import an_episode
 from test_effects_model import block
 from test_noise import STD, episode_of, silent
 
-from tpcd.data.episode import write_episode
+from tpcd.data.files import write_episode
 from tpcd.data.header import Header, read_header
 from tpcd.data.measured import Measured, measured_contents
 from tpcd.discrepancy.checks import check_one_set_up, one_noise, read_data

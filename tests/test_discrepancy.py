@@ -10,18 +10,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings, start_cloud
+from tpcd.belief.cloud import start_cloud
 from tpcd.belief.history import history_of, joined_history
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
+from tpcd.belief.settings import SamplerSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, Coverage, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
-from tpcd.discrepancy.evidence import Fit, Question, fit_model
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound, typical_share
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.report_parts import shown_value
@@ -38,7 +40,14 @@ from tpcd.truth.scene import draw_scene, make_truth
 
 SMALL = DiagnosisSettings(
     sampler=SamplerSettings(
-        particles=150, draws=600, prior_draws=200, fresh_modes=40, modes=8, rounds=2, places=40
+        particles=150,
+        draws_per_place=9,
+        draws=600,
+        prior_draws=200,
+        fresh_modes=40,
+        modes=8,
+        rounds=2,
+        places=40,
     ),
     catalogue=tuple(find_effect(n) for n in ("floor_compliance", "floor_tilt", "command_lag")),
     full_fits=2,

@@ -16,7 +16,8 @@ from tpcd.belief.belief import Belief, prior_belief
 from tpcd.belief.history import history_of
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.storage import load_belief, save_belief
-from tpcd.data.episode import Episode, write_episode
+from tpcd.data.episode import Episode
+from tpcd.data.files import write_episode
 from tpcd.effects import CATALOGUE, KNOWN, Effect
 from tpcd.effects.check import check_effect
 from tpcd.effects.model import Model, load_effects, load_model, write_model

@@ -18,7 +18,8 @@ from tpcd.belief.state import EstimatorState
 from tpcd.belief.storage import load_belief
 from tpcd.commands.estimation import EstimationRun
 from tpcd.commands.exploration_run import Kept, Stopping, expected_error, run_exploration
-from tpcd.data.episode import Episode, read_episode
+from tpcd.data.episode import Episode
+from tpcd.data.files import read_episode
 from tpcd.exploration import Estimator, ExplorationStep, explore
 from tpcd.policies import ActivePolicy, ActiveSettings, Limits, Policy, make_policy
 from tpcd.policies.active import Task
@@ -31,6 +32,7 @@ from tpcd.truth.scene import Scene, draw_scene, make_truth
 
 SMALL = ActiveSettings(first=24, rounds=1, later=12, elite=4, particles=30, finalists=3)
 FAST = SamplerSettings(particles=80, draws=500, places=20, fresh_modes=20, prior_draws=300)
+CLOSING = replace(FAST, draws=2000, places=80, fresh_modes=80)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def estimator_of(kind: str) -> Estimator:
     return Estimator(
         load_prior("ycb21-z2"),
         kind,  # type: ignore[arg-type]
-        EstimatorSettings(sampler=FAST),
+        EstimatorSettings(sampler=FAST, closing=CLOSING),
         PaperSettings(particles=150),
     )
 

@@ -24,7 +24,8 @@ from made_logs import (
 )
 from scipy.spatial.transform import Rotation
 
-from tpcd.data.episode import Episode, read_episode, write_together
+from tpcd.data.episode import Episode
+from tpcd.data.files import read_episode, write_together
 from tpcd.data.measured import Measured, NoCommandsError, read_measured
 from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import LogError

@@ -11,7 +11,8 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from tpcd.data.episode import Episode, write_episode
+from tpcd.data.episode import Episode
+from tpcd.data.files import write_episode
 from tpcd.data.noise import check_noise, estimate_noise, resolution
 from tpcd.data.noisy import read_noisy
 from tpcd.effects import CATALOGUE

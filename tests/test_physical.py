@@ -11,7 +11,7 @@ from robot_bench import free_address
 
 from eval.physical import Physical, evaluate_physical
 from eval.physical_sessions import ORIGIN, WALL_BASE
-from tpcd.data.episode import read_episode
+from tpcd.data.files import read_episode
 
 
 def test_every_object_has_its_tiles() -> None:

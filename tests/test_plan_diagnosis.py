@@ -115,6 +115,11 @@ def test_a_plan_that_could_harm_is_refused(
         diagnosis_plan(torch.tensor(start).double(), FLOOR_Z, wall, STIFFNESS, 60, error)
 
 
+def test_a_stiffness_in_newtons_per_millimetre_is_refused() -> None:
+    with pytest.raises(ValueError, match="check that the stiffness is in N/m"):
+        diagnosis_plan(START, FLOOR_Z, WALL_X, 1e-3 * STIFFNESS, 60, 0.005)
+
+
 def test_the_command_writes_a_plan(tmp_path: Path) -> None:
     out = tmp_path / "commands.csv"
     words = ("--start", "0", "0.12", "0", "--floor-height", "0.05", "--wall-position", "0.1")

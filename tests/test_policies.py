@@ -127,6 +127,25 @@ def test_excess_probability_is_the_share_of_particles_whose_floor_is_too_high(
     assert float(found[1]) == 0.0
 
 
+def test_the_force_limit_is_about_the_wrench_of_the_effects(
+    belief: Belief, episode: Episode
+) -> None:
+    """Twice as stiff as the arm says, and a lag that leaves no force at all in free air."""
+    start = row_at(episode, (0.0, 0.2, 0.0)).poses
+    down = torch.tensor([[0.0, -0.02, 0.0]], dtype=torch.float64)
+    plain = ContactPredictor(belief).predict(start, down)
+    mean = plain.true_moments()[0][..., 3:]
+    limits = Limits(force=float(mean[:, 0, 1].abs().quantile(0.9)))
+    assert float(limits.excess_probability(plain)[0]) < 0.2
+    matrix = torch.diag(plain.stiffness).expand(*mean.shape[:2], 3, 3)
+    stiff = replace(plain, component_wrench=2 * mean, wrench_matrix=2 * matrix)
+    share = plain.weights[:, 0] @ (2 * mean[:, 0, 1].abs() > limits.force).double()
+    assert float(share) > 0.4
+    assert float(limits.excess_probability(stiff)[0]) == pytest.approx(float(share), abs=0.05)
+    slack = replace(plain, component_wrench=0 * mean, wrench_matrix=0 * matrix)
+    assert float(Limits(force=1e-3).excess_probability(slack)[0]) == 0.0
+
+
 def test_the_best_allowed_command_is_taken_and_else_the_gentlest() -> None:
     gain = torch.tensor([1.0, 3.0, 2.0], dtype=torch.float64)
     assert best_within(gain, torch.tensor([0.0, 0.5, 0.01]), 0.05) == 2

@@ -6,6 +6,9 @@ the field changes with the angle: what the predictor adds to its step counts.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -16,10 +19,11 @@ from tpcd.belief.prior import make_prior
 from tpcd.contact import scene_from_parameters
 from tpcd.effects.catalogue import find_effect
 from tpcd.parameters import Parameters
+from tpcd.planar import rotate
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings, simulate_step
+from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
 
 FIELD = MisfitField(sd=1e-3)
 STIFFNESS = torch.tensor([1000.0, 1000.0, 10.0], dtype=torch.float64)
@@ -69,7 +73,13 @@ def expected(shape: PolygonShape, moves: tuple[Tensor, Tensor]) -> Tensor:
 )
 def predictor(request: pytest.FixtureRequest, shape: PolygonShape) -> ContactPredictor:
     """Of one particle that knows its field, with effects that do nothing."""
-    prior = make_prior(shape, effects=[find_effect(name) for name in request.param])
+    return predictor_of(shape, request.param, 1e-5, COEFFICIENTS)
+
+
+def predictor_of(
+    shape: PolygonShape, effects: tuple[str, ...], misfit_sd: float, coefficients: Tensor
+) -> ContactPredictor:
+    prior = make_prior(shape, effects=[find_effect(name) for name in effects])
     null = torch.zeros(1, len(prior.names) - THETA.shape[1], dtype=torch.float64)
     size = COEFFICIENTS.shape[1]
     belief = Belief(
@@ -77,8 +87,8 @@ def predictor(request: pytest.FixtureRequest, shape: PolygonShape) -> ContactPre
         vectors=torch.cat((THETA, null), dim=-1),
         weights=torch.ones(1, dtype=torch.float64),
         misfit=FIELD,
-        misfit_sd=torch.tensor([1e-5], dtype=torch.float64),
-        misfit_mean=COEFFICIENTS,
+        misfit_sd=torch.tensor([misfit_sd], dtype=torch.float64),
+        misfit_mean=coefficients,
         misfit_covariance=torch.zeros(1, size, size, dtype=torch.float64),
         step=StepSettings(),
         stiffness=STIFFNESS,
@@ -119,3 +129,44 @@ def test_rollouts_end_there(
             start, command[None], torch.Generator().manual_seed(0), samples=3, previous=start
         )
         torch.testing.assert_close(drawn[:, 0, :3], end.expand(3, 3), atol=TOLERANCE, rtol=0.0)
+
+
+@pytest.mark.parametrize("effects", [(), ("floor_compliance",)], ids=["", "soft"])
+def test_rollouts_are_as_unsure_as_predictions_where_no_bump_reaches(
+    shape: PolygonShape, effects: tuple[str, ...]
+) -> None:
+    """At 0.6 and 0.9 rad the field's known coefficients tell little of the outline, or nothing."""
+    unsure = predictor_of(shape, effects, 2e-3, torch.zeros_like(COEFFICIENTS))
+    for angle in (0.6, 0.9):
+        turned = rotate(torch.tensor(angle), torch.from_numpy(shape.outline.vertices.copy()))
+        z = -float(turned[:, 1].min())
+        start = torch.tensor([0.0, z + 0.02, angle], dtype=torch.float64)
+        down = torch.tensor([[0.0, z - 0.02, angle]], dtype=torch.float64)
+        expected = float(unsure.predict(start[None], down, previous=start[None]).std[0, 1])
+        assert expected > 1e-3
+        drawn = unsure.rollout(
+            start, down, torch.Generator().manual_seed(0), samples=2000, previous=start
+        )
+        assert float(drawn[:, 0, 1].std()) == pytest.approx(expected, rel=0.1)
+
+
+def test_a_trajectory_without_answer_is_replaced_by_another(
+    shape: PolygonShape, moves: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoilt(*arguments: Any, **named: Any) -> Transition:
+        found = simulate_step(*arguments, **named)
+        status = found.status.clone()
+        status[: int(lost)] = int(StepStatus.INVALID_INPUT)
+        pose = torch.where((status == 3)[:, None], torch.nan, found.pose)
+        return replace(found, status=status, pose=pose)
+
+    known = predictor_of(shape, (), 1e-5, COEFFICIENTS)
+    (start, _), (command, _) = moves
+    arguments = (start, command[None], torch.Generator().manual_seed(0), 4, start)
+    lost = 0
+    whole = known.rollout(*arguments)
+    monkeypatch.setattr("tpcd.predict.simulate_step", spoilt)
+    lost = 3
+    torch.testing.assert_close(known.rollout(*arguments), whole, atol=1e-4, rtol=0)
+    lost = 4
+    assert torch.isnan(known.rollout(*arguments)).all()

@@ -16,7 +16,7 @@ from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.augmented import found_effects, with_model
 from tpcd.belief.belief import Belief
 from tpcd.commands.prediction import measured_rows, prediction_error
-from tpcd.data.episode import read_episode
+from tpcd.data.files import read_episode
 from tpcd.effects import CATALOGUE
 from tpcd.effects.catalogue import find_effect
 from tpcd.effects.model import Model, load_model, write_model

@@ -41,6 +41,33 @@ def test_a_folder_with_content_is_refused_and_left_alone(tmp_path: Path) -> None
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.parametrize("named", ["explore.csv", "explore", "raw/log.csv", "raw", "."])
+def test_a_run_that_holds_what_the_command_reads_is_not_overwritten(
+    tmp_path: Path, named: str
+) -> None:
+    run = open_run(tmp_path / "run", "x", {})
+    (run / "raw").mkdir()
+    for file in ("explore.csv", "raw/log.csv"):
+        (run / file).write_text("measured once")
+    for config in ({"out": run, "episode": run / named}, {"out": run, "logs": (str(run / named),)}):
+        for start in (open_run, run_folder):
+            with pytest.raises(RunError, match="which would be removed"):
+                opened = start(run, "x", config, overwrite=True)
+                with opened:  # type: ignore[union-attr]
+                    pass
+        assert (run / "explore.csv").is_file() and (run / "raw" / "log.csv").is_file()
+    open_run(run, "x", {"out": run, "episode": tmp_path / "elsewhere.csv"}, overwrite=True)
+    assert not (run / "explore.csv").exists()
+
+
+def test_a_target_is_no_file_that_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "test_0.csv"
+    file.write_text("measured once")
+    check_target(file, overwrite=True, inputs=[tmp_path / "other.csv"])
+    with pytest.raises(RunError, match="is what the command reads"):
+        check_target(file, overwrite=True, inputs=[tmp_path / "x" / ".." / "test_0.csv"])
+
+
 def test_overwriting_leaves_nothing_of_the_earlier_run(tmp_path: Path) -> None:
     folder = open_run(tmp_path / "run", "x", {})
     (folder / "old.png").write_bytes(b"")

@@ -8,16 +8,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
+from tpcd.belief.settings import SamplerSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy import rivals, workbench
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Candidate
-from tpcd.discrepancy.evidence import Fit, Question, fit_model
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings
@@ -32,7 +33,14 @@ from tpcd.truth.scene import draw_scene, make_truth
 MUG = builtin_outlines()["mug"]
 SETTINGS = DiagnosisSettings(
     sampler=SamplerSettings(
-        particles=100, draws=400, prior_draws=100, fresh_modes=12, modes=6, rounds=2, places=24
+        particles=100,
+        draws_per_place=9,
+        draws=400,
+        prior_draws=100,
+        fresh_modes=12,
+        modes=6,
+        rounds=2,
+        places=24,
     ),
     catalogue=(find_effect("wall_friction"), find_effect("floor_tilt")),
 )

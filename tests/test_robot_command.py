@@ -10,7 +10,7 @@ import torch
 from command_calls import PRIOR, load_script
 from robot_bench import SURFACE, emulator_settings
 
-from tpcd.data.episode import read_episode
+from tpcd.data.files import read_episode
 from tpcd.robot.emulator import emulated_scene
 from tpcd.robot.emulator.process import running_emulator
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import shapely
 
-from tpcd.shape.builtin import ENTRIES, builtin_outlines, random_outlines, vary
+from tpcd.shape.builtin import builtin_outlines, random_outlines, vary
+from tpcd.shape.household import ENTRIES
 from tpcd.shape.outline import make_outline, turning_angles
 
 BUILTIN = builtin_outlines()

@@ -11,8 +11,9 @@ from contact_scenes import BOX, SLAB, STIFFNESS, make_scene, vector
 from tpcd.contact import ContactScene, place_points, scene_from_parameters
 from tpcd.parameters import Parameters
 from tpcd.planar import rotate
-from tpcd.shape.builtin import ENTRIES, make_entry
+from tpcd.shape.builtin import make_entry
 from tpcd.shape.checkpoint import load_prior
+from tpcd.shape.household import ENTRIES
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import ContactMode, StepSettings, StepStatus, simulate_step
 

@@ -13,7 +13,8 @@ import pytest
 import torch
 from contact_scenes import OUTLINES, make_scene
 
-from tpcd.shape.builtin import ENTRIES, make_entry
+from tpcd.shape.builtin import make_entry
+from tpcd.shape.household import ENTRIES
 from tpcd.simulator import StepSettings, simulate_step
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth

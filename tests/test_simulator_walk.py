@@ -17,7 +17,8 @@ from contact_scenes import BOX, STIFFNESS, flush_corner, make_scene, vector
 
 from tpcd.contact import scene_from_parameters
 from tpcd.parameters import Parameters
-from tpcd.shape.builtin import ENTRIES, make_entry
+from tpcd.shape.builtin import make_entry
+from tpcd.shape.household import ENTRIES
 from tpcd.simulator import StepSettings, simulate_step
 from tpcd.simulator.walk import (
     AIM,

@@ -11,7 +11,7 @@ from injected_parts import FORCE, HOOK, LENGTH, NOMINAL, PRESS_1, follow, lowest
 
 from tpcd.truth.injected import InjectedMujocoTruth
 from tpcd.truth.injected_effects import FORMS
-from tpcd.truth.mujoco_truth import MujocoSettings
+from tpcd.truth.mujoco_scene import MujocoSettings
 
 
 def test_the_true_stiffness_makes_the_forces():

@@ -11,7 +11,8 @@ import torch
 
 from tpcd.errors import SolverError
 from tpcd.truth.hull import hull_vertices
-from tpcd.truth.mujoco_truth import MujocoSettings, MujocoTruth
+from tpcd.truth.mujoco_scene import MujocoSettings
+from tpcd.truth.mujoco_truth import MujocoTruth
 
 FORCE_TOLERANCE = 5e-3
 """Closed forms hold to this [N]; torques to the same number [N·m]."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.belief.belief import Belief
@@ -177,6 +177,8 @@ class ContactPredictor:
         """Draw whole trajectories: every particle follows its own poses, n steps long.
 
         Each trajectory keeps one theta, its effects and one draw of its misfit field throughout.
+        What the field does not cover is drawn at each step. A trajectory that a step has no answer
+        for is replaced by another one; where all are, everything is NaN.
         """
         chosen = torch.multinomial(self.weights, samples, replacement=True, generator=generator)
         scene = self._scene.gather(chosen)
@@ -186,10 +188,13 @@ class ContactPredictor:
             field = field + (self._field_root[chosen] @ noise[..., None])[..., 0]
         pose, commands = pose.double(), commands.double()
         before = None if previous is None else previous.double()
+        gaps = self._gap(field[:, None], commands[:, 2])
+        rough = None if gaps is None else gaps + self._uncovered(chosen, commands[:, 2], generator)
         walk = None
         if self._added.effects:
             rest = pose if before is None else before
             everything = torch.cat((rest[None], commands))
+            begin = self._gap(field[:, None], rest[None, 2])
             walk = RowByRow(
                 self._flat.gather(chosen),
                 everything,
@@ -197,14 +202,15 @@ class ContactPredictor:
                 self._added[chosen],
                 self.belief.step,
                 pose,
-                self._gap(field[:, None], everything[:, 2]),
+                None if begin is None or rough is None else torch.cat((begin, rough), dim=1),
             )
+        usable = torch.ones(samples, dtype=torch.bool)
         here, steps = pose.expand(samples, 3), []
         stiffness = self.belief.stiffness
         for row, command in enumerate(commands, start=1):
-            gap = self._gap(field, command[2])
+            gap = None if gaps is None else gaps[:, row - 1]
             if walk is None:
-                world = scene if gap is None else scene.further(gap)
+                world = scene if rough is None else scene.further(rough[:, row - 1])
                 transition = simulate_step(
                     world, here, command, stiffness, self.belief.step, previous=before
                 )
@@ -212,7 +218,8 @@ class ContactPredictor:
                 found = walk.settle(row, here)
                 transition = Transition(**{n: v[:, 0] for n, v in vars(found.transition).items()})
             here = transition.pose
-            rows, uncovered = misfit_rows(
+            usable = usable & (transition.status <= int(StepStatus.RELAXED))
+            rows, _ = misfit_rows(
                 self.belief.misfit, self._field_sd[chosen], here[..., 2], transition
             )
             shift = _shift(rows, field, transition, gap)
@@ -225,7 +232,24 @@ class ContactPredictor:
                 wrench = found.wrench[:, 0] + (found.matrix[:, 0] @ shift[..., None])[..., 0]
             steps.append(torch.cat((here, wrench), dim=-1))
             before = command
-        return torch.stack(steps, dim=1)
+        found_steps = torch.stack(steps, dim=1)
+        usable = usable & torch.isfinite(found_steps).flatten(1).all(-1)
+        if not bool(usable.any()):
+            return torch.full_like(found_steps, torch.nan)
+        others = torch.multinomial(usable.double(), samples, replacement=True, generator=generator)
+        return found_steps[torch.where(usable, torch.arange(samples), others)]
+
+    def _uncovered(
+        self, chosen: Int[Tensor, " s"], angles: Float[Tensor, " n"], generator: torch.Generator
+    ) -> Float[Tensor, "s n t"]:
+        """Draws of the part of the gaps that the field's bumps do not cover."""
+        terrains = self._flat.friction.shape[-1]
+        value, _ = self.belief.misfit.basis(angles)
+        left = (1 - (value**2).sum(-1)).clamp_min(0.0).sqrt()
+        noise = torch.randn(
+            len(chosen), len(angles), terrains, generator=generator, dtype=torch.float64
+        )
+        return self._field_sd[chosen, None, None] * left[:, None] * noise
 
 
 def _shift(

@@ -104,9 +104,11 @@ class Prediction:
         matrix = self._matrix().expand(*self.weights.shape, 3, 3)[chosen, columns]
         draws = mean + torch.cat((moved, matrix @ moved), dim=-2)[..., 0]
         sensor = torch.randn(draws.shape, generator=generator, dtype=mean.dtype)
-        return draws + sensor * self.sensor_variance.sqrt()
+        draws = draws + sensor * self.sensor_variance.sqrt()
+        return torch.where(self.answered[:, None], draws, torch.nan)
 
-    def _components(self) -> tuple[Tensor, Tensor]:
+    def true_moments(self) -> tuple[Float[Tensor, "m n 6"], Float[Tensor, "m n 6"]]:
+        """Mean and variance of pose and wrench given the particle, without what sensors add."""
         wrench = self.component_wrench
         if wrench is None:
             offset = self.component_mean - self.command
@@ -116,6 +118,10 @@ class Prediction:
         spread = ((matrix @ covariance) * matrix).sum(-1)
         variance = torch.cat((self.component_variance, spread), dim=-1)
         mean = torch.cat((self.component_mean, wrench), dim=-1)
+        return mean, variance
+
+    def _components(self) -> tuple[Tensor, Tensor]:
+        mean, variance = self.true_moments()
         return mean, (variance + self.sensor_variance).sqrt()
 
     def _matrix(self) -> Tensor:

@@ -32,10 +32,12 @@ def open_run(
 
     `command` names the program (`scripts/estimate.py`), `config` is its dataclass or a
     mapping. Raises `RunError` when the folder already holds something; with `overwrite`
-    an earlier run there is removed, but never a folder that is not a run.
+    an earlier run there is removed, but never a folder that is not a run, or that holds a file
+    which the configuration names.
     """
     folder = Path(path)
     if _holds_run(folder, overwrite):
+        _spare_inputs(folder, config)
         shutil.rmtree(folder)
     return _started(folder, command, config)
 
@@ -57,6 +59,8 @@ def run_folder(
     folder = Path(path).absolute()
     aside = folder.with_name(f".{folder.name}.{os.getpid()}.earlier")
     replacing = _holds_run(Path(path), overwrite)
+    if replacing:
+        _spare_inputs(Path(path), config)
     was_there = folder.is_dir() and not replacing
     new_parents = [parent for parent in folder.parents if not parent.exists()]
     if replacing:
@@ -82,13 +86,17 @@ def run_folder(
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def check_target(path: str | Path, overwrite: bool = False) -> None:
+def check_target(
+    path: str | Path, overwrite: bool = False, inputs: Sequence[str | Path] = ()
+) -> None:
     """Refuse a file that could not be written in the end, before the work begins.
 
-    Raises `RunError` where it exists and `overwrite` is false, is a folder, or lies where
-    nothing can be written.
+    Raises `RunError` where it exists and `overwrite` is false, is a folder or one of the `inputs`,
+    or lies where nothing can be written.
     """
     path = Path(path)
+    if any(Path(name).resolve() == path.resolve() for name in inputs):
+        raise RunError(path, "is what the command reads", "choose another name")
     if path.is_dir():
         raise RunError(path, "is a folder", "name a file")
     if path.exists() and not overwrite:
@@ -110,6 +118,27 @@ def _holds_run(folder: Path, overwrite: bool) -> bool:
             folder, f"is not a run (no {VERSIONS_FILE}), not overwritten", "name a new folder"
         )
     return True
+
+
+def _spare_inputs(folder: Path, config: Mapping[str, Any] | Any) -> None:
+    """Refuse to remove what the configuration names, such as the recording to work on."""
+    whole = folder.resolve()
+    for key, value in (config if isinstance(config, Mapping) else vars(config)).items():
+        names = value if isinstance(value, (tuple, list)) else (value,)
+        for name in names:
+            if key == "out" or not isinstance(name, (str, Path)) or not str(name):
+                continue
+            place = Path(name).resolve()
+            within = place == whole or whole in place.parents
+            if within and (place.exists() or _episode_there(place)):
+                raise RunError(
+                    folder, f"holds {name}, which would be removed", "name a new folder for --out"
+                )
+
+
+def _episode_there(place: Path) -> bool:
+    """Whether the path is an episode's name without its suffix."""
+    return any(place.with_name(place.name + suffix).exists() for suffix in (".csv", ".parquet"))
 
 
 def _check_place(folder: Path) -> None:

@@ -1,9 +1,9 @@
 """The belief over theta: likelihood, resampling, samplers, and the paper's filter."""
 
-from tpcd.belief.belief import Belief, EstimationStep, EstimatorSettings, estimate
-from tpcd.belief.cloud import SamplerSettings
+from tpcd.belief.belief import Belief, EstimationStep, estimate
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.refinement import refine
+from tpcd.belief.settings import EstimatorSettings, SamplerSettings
 
 __all__ = [
     "Belief",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -19,7 +19,6 @@ from torch import Tensor
 from tpcd.belief.cloud import (
     Cloud,
     CloudInfo,
-    SamplerSettings,
     cloud_from_tensors,
     cloud_to_tensors,
     start_cloud,
@@ -31,59 +30,17 @@ from tpcd.belief.likelihood import effective_setting
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.resampling import weighted_quantile
+from tpcd.belief.settings import EstimatorSettings
 from tpcd.belief.state import EstimatorState
 from tpcd.belief.target import ContactTarget
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
-from tpcd.effects.protocol import Effect
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
 _SOME_FREE = 1e-3
 """Where no draw is free at the start with this probability, they are not weighted by it."""
-
-
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """Choices of the default estimator."""
-
-    sampler: SamplerSettings = field(default_factory=SamplerSettings)
-    """Budget of the sampler."""
-    step: StepSettings = field(default_factory=StepSettings)
-    """The quasi-static model."""
-    misfit_sd: float | None = None
-    """Median of the standard deviation of the outline misfit [m] before any datum; None takes
-    the shape model's own figure."""
-    misfit_spread: float = 1.0
-    """Standard deviation of the logarithm of that standard deviation; 0 makes it known."""
-    misfit_width: float = 0.15
-    """How far the object turns until the outline error is another one [rad]."""
-    least_misfit_sd: float = 1e-4
-    """The median is never taken to be less than this [m]."""
-    effects: tuple[Effect, ...] = ()
-    """Effects that the model has besides, whose parameters are estimated with theta."""
-    effect_draws: int = 3
-    """Times as many draws where there are effects: with what was missing in the model the
-    posterior is narrower, and its best modes are missed more easily."""
-
-    @property
-    def budget(self) -> SamplerSettings:
-        """Of the sampler, for the model with its effects."""
-        more = self.effect_draws if self.effects else 1
-        return replace(self.sampler, draws=more * self.sampler.draws)
-
-    @property
-    def closing_budget(self) -> SamplerSettings:
-        """Of the sampler once all data are in."""
-        budget, times = self.budget, self.sampler.closing
-        return replace(
-            budget,
-            places=times * budget.places,
-            draws=times * budget.draws,
-            modes=times * budget.modes,
-            fresh_modes=times * budget.fresh_modes,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +62,9 @@ class Belief:
     step: StepSettings
     stiffness: Float[Tensor, " 3"]
     log_evidence: float
+    """Of the likelihood to the power of `EstimatorSettings.power`."""
     log_evidence_std: float
+    """Its standard error over the draws."""
 
     @property
     def parameters(self) -> Parameters:
@@ -171,7 +130,7 @@ def estimate(
 def target_of(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
     """The posterior to sample from, still without data."""
     prior = make_prior(shape, episode.priors, settings.effects)
-    return ContactTarget(prior, misfit_field(shape, settings), settings.step)
+    return ContactTarget(prior, misfit_field(shape, settings), settings.step, power=settings.power)
 
 
 def prior_belief(
@@ -198,7 +157,7 @@ def prior_belief(
     starts = start_gaps(scene.points_ee, setting, history.poses[:, 2], torch.tensor([0]))
     free = starts.log_free_before(misfit, sd).exp()
     tells = bool(rests_free(history)[0]) and float(free.max()) > _SOME_FREE
-    weights = free if tells else torch.ones_like(free)
+    weights = free**settings.power if tells else torch.ones_like(free)
     size = misfit.bumps * len(scene.terrains)
     return Belief(
         prior=prior,

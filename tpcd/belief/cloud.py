@@ -1,4 +1,4 @@
-"""The weighted particles that stand for a posterior, the budget that finds them, and its record."""
+"""The weighted particles that stand for a posterior, what they are drawn for, and their record."""
 
 from __future__ import annotations
 
@@ -70,59 +70,6 @@ class Counted:
         """Of the target."""
         self.evaluations += CURVATURE_COST * len(positions)
         return self.target.curvature(positions)
-
-
-@dataclass(frozen=True)
-class SamplerSettings:
-    """Budget of the sampler for each datum."""
-
-    particles: int = 700
-    """Particles kept of all draws."""
-    places: int = 80
-    """Places that each round of importance sampling puts components at."""
-    draws_per_place: int = 9
-    """Draws at each place."""
-    rounds: int = 3
-    """Rounds of importance sampling that shape the mixture."""
-    draws: int = 3000
-    """Draws from the mixture that the rounds arrived at, which are weighted."""
-    prior_draws: int = 1500
-    """Draws from the prior at the first datum, falling as 1 / k with datum k."""
-    modes: int = 20
-    """Modes that are remembered from datum to datum."""
-    fresh_modes: int = 120
-    """Points that set out to climb to a mode at each datum."""
-    climbing_rounds: int = 2
-    """Newton steps before the lower half of those gives up."""
-    following_rounds: int = 3
-    """Newton steps of the modes that are remembered, and of those that did not give up."""
-    closing: int = 4
-    """Times as many places, modes and draws once no more data are to come (see `refine`)."""
-    closing_passes: int = 4
-    """Times at most that those are drawn, each from where the one before arrived."""
-    closing_worth: float = 1000.0
-    """Effective sample size with which they need not be drawn again."""
-
-    def __post_init__(self) -> None:
-        """Refuse budgets without meaning."""
-        least = {
-            "particles": 16,
-            "places": 1,
-            "draws_per_place": 1,
-            "rounds": 1,
-            "draws": 100,
-            "prior_draws": 1,
-            "modes": 1,
-            "fresh_modes": 1,
-            "climbing_rounds": 0,
-            "following_rounds": 0,
-            "closing": 1,
-            "closing_passes": 1,
-            "closing_worth": 0,
-        }
-        for name, limit in least.items():
-            if not getattr(self, name) >= limit:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.filtered import HistoryLikelihood, Steps, filter_history
-from tpcd.belief.kalman import OUTLIER_SQUARE
+from tpcd.belief.kalman import FAR, OUTLIER_SQUARE
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import Setting
 from tpcd.simulator import StepSettings, native
@@ -32,7 +32,8 @@ def compiled_filter(
     by_theta: SceneSlopes | None = None,
 ) -> HistoryLikelihood:
     """The same as `filter_history`; particles that jam are left to it."""
-    from tpcd.belief.kernel import Found, Given, Measured, explain_range
+    from tpcd.belief.kernel import explain_range
+    from tpcd.belief.kernel_given import Found, Given, Measured
     from tpcd.simulator.kernel_slopes import SceneSlopes
 
     conditions, merged = setting.conditions, setting.merged
@@ -69,6 +70,7 @@ def compiled_filter(
         misfit_sd.contiguous().numpy(),
         setting.used.numpy(),
         OUTLIER_SQUARE,
+        FAR,
     )
     total = torch.empty(count, dtype=torch.float64)
     mean = torch.zeros(count, size, dtype=torch.float64)

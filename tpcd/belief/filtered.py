@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tpcd.belief.kalman import Innovation, assimilate, first_state, parted
+from tpcd.belief.kalman import FAR, PASSES, Innovation, assimilate, first_state, parted
 from tpcd.belief.misfit import MisfitField, misfit_rows
 from tpcd.belief.setting import Setting
 from tpcd.contact import ContactScene
@@ -81,34 +81,45 @@ def filter_history(
             settled.append(nothing)
             continue
         begins, ends = (_turn(conditions.turn, row) for row in (k, k + 1))
-        here = _column(scene, k + 1)
+        before, angle, here = state, setting.angles[k], _column(scene, k + 1)
         # What the field changes is known in part, and contact there is not as without it. The gap
         # at the end's angle serves for the start as well.
-        if count:
-            gap = field.gap(state.mean[:, :count], setting.angles[k])
-            here = here.further(gap)
-        transition = simulate_step(
-            here,
-            merged.poses[:, k] - state.mean[:, count:] + begins,
-            _row(conditions.target - conditions.carried, k + 1) + ends,
-            _row(conditions.stiffness, k + 1),
-            settings,
-            previous=_row(conditions.target, k) + begins,
-        )
-        pose = transition.pose - ends + _row(conditions.give, k + 1)
-        residual = angle_difference(merged.poses[:, k + 1], pose)
-        if count:
-            # As from no field at all, along the derivatives where it was stepped.
-            residual = residual + (transition.pose_from_gap * gap[..., None]).sum(-2)
-        rows, uncovered = misfit_rows(field, sd, setting.angles[k], transition)
-        usable = (transition.status <= int(StepStatus.RELAXED)) & finite
-        usable = usable & torch.isfinite(residual).all(-1)
-        # What is not usable must not reach a factorisation.
-        parts = (residual, rows, transition.pose_from_start, uncovered)
-        residual, rows, from_start, uncovered = (
-            torch.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in parts
-        )
-        state, found = assimilate(state, residual, rows, from_start, variance, uncovered)
+        gap = field.gap(state.mean[:, :count], angle) if count else None
+        for again in range(PASSES):
+            transition = simulate_step(
+                here if gap is None else here.further(gap),
+                merged.poses[:, k] - before.mean[:, count:] + begins,
+                _row(conditions.target - conditions.carried, k + 1) + ends,
+                _row(conditions.stiffness, k + 1),
+                settings,
+                previous=_row(conditions.target, k) + begins,
+            )
+            pose = transition.pose - ends + _row(conditions.give, k + 1)
+            residual = angle_difference(merged.poses[:, k + 1], pose)
+            if gap is not None:
+                # As from no field at all, along the derivatives where it was stepped.
+                residual = residual + (transition.pose_from_gap * gap[..., None]).sum(-2)
+            rows, uncovered = misfit_rows(field, sd, angle, transition)
+            usable = (transition.status <= int(StepStatus.RELAXED)) & finite
+            usable = usable & torch.isfinite(residual).all(-1)
+            # What is not usable must not reach a factorisation.
+            parts = (residual, rows, transition.pose_from_start, uncovered)
+            residual, rows, from_start, uncovered = (
+                torch.where(usable.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0) for part in parts
+            )
+            state, found = assimilate(before, residual, rows, from_start, variance, uncovered)
+            if gap is None or again == PASSES - 1:
+                break
+            if again == 0:
+                first, explained = gap, found.explained & usable
+                known = field.gap(state.mean[:, :count], angle)
+                other = usable & ((known - gap).abs().amax(-1) > FAR)
+                gap = torch.where(other[:, None], known, gap)
+            else:
+                other = explained & usable & ~found.explained
+                gap = torch.where(other[:, None], first, gap)
+            if not bool(other.any()):
+                break
         total = total + torch.where(usable, found.log_density, -torch.inf)
         parts = (found.whitened, found.log_scale)
         each.append(Innovation(*(torch.where(usable[:, None], p, torch.nan) for p in parts)))

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpcd.belief.cloud import Cloud, CloudInfo, Counted, SamplerSettings, Target
+from tpcd.belief.cloud import Cloud, CloudInfo, Counted, Target
 from tpcd.belief.modes import Climbers, climb, find_modes, set_out
 from tpcd.belief.pareto import tail_shape
 from tpcd.belief.pool import (
@@ -33,6 +33,7 @@ from tpcd.belief.pool import (
 )
 from tpcd.belief.proposals import CurvedMixture, curved_mixture
 from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.settings import SamplerSettings
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
@@ -41,6 +42,8 @@ _TRUSTED = 5
 _FEWEST_PLACES = 300.0
 """Places are chosen as if no draw had more than this share of the weight (1 / count), so that
 components also go where the draws found little so far."""
+_LARGEST_SHARE = 10.0
+"""Of few draws that have a weight each may have so many times its even share."""
 
 
 def assimilate(
@@ -106,7 +109,7 @@ def draw_pool(
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
         if left == 0:
             break
-        centres = trial.positions[_spread_choice(log_weights, settings.places, generator)]
+        centres = trial.positions[spread_choice(log_weights, settings.places, generator)]
         counts = _counts(shares, settings.draws_per_place)
         mixture = curved_mixture(centres, *target.curvature(centres), counts)
     assert trial.mixture is not None
@@ -186,11 +189,12 @@ def _follow(
     if not bool(torch.isfinite(log_weights).any()):
         # Nobody explains it; the places then are those of the history before.
         log_weights = cloud.weights.log()
-    places = cloud.positions[_spread_choice(log_weights, settings.places, generator)]
+    places = cloud.positions[spread_choice(log_weights, settings.places, generator)]
     return climb(target, set_out(target, places), 1).surveyed(target)
 
 
-def _spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices drawn by weight, none of which may take more than a small share."""
-    weights = cut_off(known_weights(log_weights), _FEWEST_PLACES)
+    weights = known_weights(log_weights)
+    weights = cut_off(weights, min(_FEWEST_PLACES, float((weights > 0).sum()) / _LARGEST_SHARE))
     return torch.multinomial(weights, count, replacement=True, generator=generator)

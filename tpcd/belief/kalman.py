@@ -13,6 +13,11 @@ one transition to the next. In free motion the arm reaches its command, and what
 there no longer matters. The innovations give the likelihood of theta term by term, and the
 state the posterior of the field (Kalman 1960; Rao-Blackwellised particle filters).
 
+Contact is anything but linear where the field is unknown by millimetres: a terrain taken to be
+there may not be touched where it is. So a transition that moves a gap far is stepped again with
+the terrain where the state after it says, and brought in from there (Bell and Cathey 1993: the
+iterated filter is Gauss and Newton's method), unless it is not explained from there.
+
 A transition far outside of what theta and the field allow (an object wedged between floor
 and wall, a bad reading) has its innovation covariance grown until the innovation lies at the
 border: its log likelihood then falls with the logarithm of the distance, as for a Student
@@ -25,12 +30,18 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 OUTLIER_SQUARE = 16.3
 """Squared Mahalanobis distance (3 degrees of freedom, 0.1 %) from which a transition counts
 as not explained: its covariance grows so that it stays at this distance."""
+
+PASSES = 3
+"""Times at most that a transition is stepped and brought in: the third is the first again, where
+the second explains less."""
+FAR = 3e-4
+"""Change of a gap [m] by which a transition is stepped again: about its reading's noise."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +60,11 @@ class Innovation:
     whitened: Float[Tensor, "m 3"]
     log_scale: Float[Tensor, "m 3"]
     """Logarithm of the units [log m, log m, log rad]."""
+
+    @property
+    def explained(self) -> Bool[Tensor, " m"]:
+        """Whether it lies within `OUTLIER_SQUARE`."""
+        return (self.whitened**2).sum(-1) < OUTLIER_SQUARE * (1 - 1e-9)
 
     @property
     def log_density(self) -> Float[Tensor, " m"]:

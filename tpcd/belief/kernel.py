@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
 
-from tpcd.belief import kernel_filter
+from tpcd.belief import kalman, kernel_filter, kernel_given
+from tpcd.belief.kalman import PASSES
 from tpcd.belief.kernel_filter import (
     assimilate,
     begin,
+    copy_state,
     expect_gap,
     follow,
+    is_explained,
     new_filter,
     pass_over,
 )
@@ -39,66 +42,6 @@ from tpcd.simulator.kernel_request import (
 from tpcd.simulator.kernel_settle import JAMMED
 from tpcd.simulator.kernel_slopes import new_slopes
 from tpcd.simulator.kernel_space import new_space
-
-
-class Measured(NamedTuple):
-    """What is known and asked of m particles over n transitions between r = n + 1 rows.
-
-    `poses` (c, r, 3) and their `variance`, the same for all particles (c = 1) or one for each;
-    `give` (c, r, 3) is that of `Conditions`. Values and `slopes` (n, j) of the bumps; `rest` (c, n)
-    what the terms after each one can still add; `least` (m) what must be reached; `sd` (m) of the
-    misfit; `limit` of an innovation's square. `used` (n) says which transitions count: the others
-    part the history.
-    """
-
-    poses: np.ndarray
-    variance: np.ndarray
-    give: np.ndarray
-    bumps: np.ndarray
-    slopes: np.ndarray
-    rest: np.ndarray
-    least: np.ndarray
-    sd: np.ndarray
-    used: np.ndarray
-    limit: float
-
-
-class Given(NamedTuple):
-    """What the arm is asked and what it meets, for m particles and r rows, or 1 of either.
-
-    `commands` and `stiffness` (.., .., 3); `turns` (.., .., 1) the angle of the object in the
-    hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` (.., .., t).
-    """
-
-    commands: np.ndarray
-    stiffness: np.ndarray
-    turns: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-    friction: np.ndarray
-    substeps: int
-    finest: float
-    largest_turn: float
-    follow_path: bool
-
-
-class Found(NamedTuple):
-    """Where the answers go: log likelihood (m), field mean (m, c) and covariance (m, c, c),
-    innovations and the logarithms of their units (m, n, 3) where they are asked for (else m = 0),
-    and derivatives (m, d, n, 3) of the innovations by d entries of theta. `poses` (m, n, 3),
-    `modes` (m, n, t) and `contacts` (m, n, t, 4) of the settled steps where they are asked for.
-    """
-
-    total: np.ndarray
-    mean: np.ndarray
-    covariance: np.ndarray
-    jammed: np.ndarray
-    whitened: np.ndarray
-    log_scale: np.ndarray
-    slopes: np.ndarray
-    poses: np.ndarray
-    modes: np.ndarray
-    contacts: np.ndarray
 
 
 def _compile_explain_range(stamp: int) -> Callable[..., None]:
@@ -176,30 +119,51 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         _meet(here, given, i, 0)
         extent = prepare(here, 0, law, request, 0, steps, chains)
         begin(state, measured, seen, measured.sd[i])
-        total = 0.0
+        total, term = 0.0, 0.0
         for k in range(steps):
             if not measured.used[k]:
                 pass_over(state, measured, seen, k, size)
                 continue
-            _meet(here, given, i, k + 1)
-            expect_gap(state, measured, k, here.offsets[0])
             set_stiffness(law, given.stiffness[firm, k + 1 if given.stiffness.shape[1] > 1 else 0])
             begins, ends = _turns(given, turned, k)
             for a in range(3):
                 starts[k, a] = measured.poses[seen, k, a] - state.mean[size + a]
             starts[k, 2] += begins
-            step_element(
-                here, 0, chains, law, extent, request, k, answer, space, slopes, poses, by_theta, i
-            )
-            answer.poses[k, 2] -= ends
-            for a in range(3):
-                answer.poses[k, a] += measured.give[seen, k + 1, a]
+            expect_gap(state, measured, k)
+            copy_state(state.mean, state.covariance, state.mean_before, state.covariance_before)
+            for t in range(terrains):
+                state.gap_before[t] = state.gap[t]
+            explained = False
+            for again in range(PASSES):
+                _meet(here, given, i, k + 1)
+                for t in range(terrains):
+                    here.offsets[0, t] -= state.gap[t]
+                step_element(
+                    here, 0, chains, law, extent, request, k,
+                    answer, space, slopes, poses, by_theta, i,
+                )  # fmt: skip
+                answer.poses[k, 2] -= ends
+                for a in range(3):
+                    answer.poses[k, a] += measured.give[seen, k + 1, a]
+                if answer.statuses[k] == JAMMED:
+                    break
+                term = assimilate(state, measured, answer, seen, k, measured.sd[i])
+                if again == 0 and math.isfinite(term):
+                    explained = is_explained(state, measured)
+                    if not expect_gap(state, measured, k) > measured.far:
+                        break
+                elif again == 1 and explained and not is_explained(state, measured):
+                    for t in range(terrains):
+                        state.gap[t] = state.gap_before[t]
+                else:
+                    break
+                copy_state(state.mean_before, state.covariance_before, state.mean, state.covariance)
             if answer.statuses[k] == JAMMED:
                 found.jammed[i] = True
                 break
             if found.poses.shape[0] > 0:
                 _keep(found, answer, i, k)
-            total += assimilate(state, measured, answer, seen, k, measured.sd[i])
+            total += term
             if found.whitened.shape[0] > 0 and math.isfinite(total):
                 for a in range(3):
                     found.whitened[i, k, a] = state.innovation[a]
@@ -250,7 +214,9 @@ def _keep(found, answer, i, k):
             found.contacts[i, k, t, a] = answer.contacts[k, t, a]
 
 
-explain_range = _compile_explain_range(source_stamp(sys.modules[__name__], kernel_filter))
+explain_range = _compile_explain_range(
+    source_stamp(sys.modules[__name__], kalman, kernel_filter, kernel_given)
+)
 """Evaluate particles `first` up to `last`: (points, law, given, measured, by_theta, found,
 first, last).
 

@@ -24,7 +24,8 @@ class Filter(NamedTuple):
     `mean` (s), `covariance` (s, s); `design` (3, s) of the residual, `cross` (3, s) first its
     covariance with the state, then the gain; `factor` (3, 3) of the residual's covariance;
     `innovation` (3) whitened; `by_theta` (d, s) derivatives of the mean. `gap` (t) is what the
-    field changes at the transition, as far as it is known.
+    field changes at the transition, as far as it is known; what ends in `before` is there to
+    go back to.
     """
 
     mean: np.ndarray
@@ -35,6 +36,9 @@ class Filter(NamedTuple):
     innovation: np.ndarray
     by_theta: np.ndarray
     gap: np.ndarray
+    mean_before: np.ndarray
+    covariance_before: np.ndarray
+    gap_before: np.ndarray
 
 
 @inner(_nrt=True)
@@ -50,6 +54,9 @@ def new_filter(size, entries, terrains):
         np.zeros((3, 3)),
         np.zeros(3),
         np.zeros((entries, size + 3)),
+        np.zeros(terrains),
+        np.zeros(size + 3),
+        np.zeros((size + 3, size + 3)),
         np.zeros(terrains),
     )
 
@@ -84,14 +91,34 @@ def pass_over(state, measured, seen, k, size):
 
 @inner
 @no_type_check
-def expect_gap(state, measured, k, offsets):
-    """Move planes away by what the field is known to change of their gaps at transition k."""
-    bumps = measured.bumps.shape[1]
+def expect_gap(state, measured, k):
+    """What the field is known to change of the gaps at transition k; returns by how much that is
+    another gap than before."""
+    bumps, furthest = measured.bumps.shape[1], 0.0
     for t in range(state.gap.shape[0]):
-        state.gap[t] = 0.0
+        before, state.gap[t] = state.gap[t], 0.0
         for j in range(bumps):
             state.gap[t] += measured.bumps[k, j] * state.mean[t * bumps + j]
-        offsets[t] -= state.gap[t]
+        furthest = max(furthest, abs(state.gap[t] - before))
+    return furthest
+
+
+@inner
+@no_type_check
+def copy_state(mean, covariance, into_mean, into_covariance):
+    """Keep a state, or go back to one."""
+    for a in range(mean.shape[0]):
+        into_mean[a] = mean[a]
+        for b in range(mean.shape[0]):
+            into_covariance[a, b] = covariance[a, b]
+
+
+@inner
+@no_type_check
+def is_explained(state, measured):
+    """Whether the last innovation lay within the limit."""
+    each = state.innovation
+    return each[0] ** 2 + each[1] ** 2 + each[2] ** 2 < measured.limit * (1.0 - 1e-9)
 
 
 @inner(error_model="numpy", forceinline=True)

@@ -2,7 +2,7 @@
 
 Each particle steps every transition from its filtered start pose and filters the residual as
 `kalman` says, which integrates the misfit field and the reading errors out. A particle whose
-step does not converge or is not finite gets log likelihood -inf.
+step fails or is not finite gets log likelihood -inf; one that has not quite converged counts.
 
 A sampler that has drawn its random number already knows what log likelihood a proposal must
 reach. No term can exceed the density of its reading's own noise at zero, log N(0; 0, R_k), so

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings, Target
+from tpcd.belief.cloud import Target
+from tpcd.belief.settings import SamplerSettings
 
 _SAME_MODE = 4.0
 """Squared distance, in the metric of the information, within which two modes are one."""

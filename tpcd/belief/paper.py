@@ -20,7 +20,7 @@ Departures from the text, and what it leaves open:
 - Normalisation in the log domain; resampling is systematic (the text does not say).
 - Noise that carries an entry out of its box is reflected at the wall. A latent whose
   roughened place the shape model does not call valid stays at its place before.
-- A particle whose step does not converge, or is not finite, gets weight zero.
+- A particle whose step fails, or is not finite, gets weight zero.
 - The weights of the filter do not estimate the evidence; that of its beliefs is NaN.
 """
 

@@ -125,8 +125,12 @@ def truncate(weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
 def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
     """Weights of which none is more than 1 / count of their sum, by and large.
 
-    The cut is repeated, since each one lowers the sum; n weights must be more than `count`.
+    The cut is repeated, since each one lowers the sum. Raises ValueError where no more than
+    `count` of them are above zero: they could only be made equal.
     """
+    positive = int((weights > 0).sum())
+    if positive <= count:
+        raise ValueError(f"count is {count}, expected less than the {positive} weights above zero")
     for _ in range(30):
         weights = weights.clamp_max(1.0 / count)
         weights = weights / weights.sum()

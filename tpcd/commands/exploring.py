@@ -17,7 +17,8 @@ from tpcd.commands.exploration_run import Kept, Stopping, run_exploration
 from tpcd.commands.exploring_options import ExploringOptions
 from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
 from tpcd.commands.summary import parameter_rows
-from tpcd.data.episode import Episode, read_episode, write_together
+from tpcd.data.episode import Episode
+from tpcd.data.files import read_episode, write_together
 from tpcd.errors import RobotError
 from tpcd.exploration import Estimator, explore
 from tpcd.policies import Limits

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,14 +18,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.commands.estimation import STEPS_FILE
+from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
 from tpcd.files import write_text
 from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 from tpcd.prediction import CHANNELS, Prediction
+from tpcd.results import RESULTS_FILE
 
 CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
 ROLLOUT_SAMPLES = 400
+
+
+def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
+    """What is suspicious about predicting these episodes from a run."""
+    found = []
+    if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
+        found.append(f"{run} was stopped before its last row; its belief is of the rows so far")
+    for episode in episodes:
+        name = "" if episode.path is None else f"{episode.path.name}: "
+        found += [name + each for each in check_episode(episode) if each != NO_CONTACT]
+    return found
 
 
 @dataclass(frozen=True)

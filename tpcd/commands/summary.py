@@ -11,7 +11,7 @@ from tpcd.belief.belief import Belief
 from tpcd.belief.resampling import weighted_quantile
 
 STILL_PRIOR = 0.85
-"""A 90 % interval wider than this share of the prior's counts as nothing learnt."""
+"""A 90 % interval that covers more than this share of the prior's counts as nothing learnt."""
 
 
 def summarise(belief: Belief) -> dict[str, Any]:
@@ -21,13 +21,14 @@ def summarise(belief: Belief) -> dict[str, Any]:
     mean, std = belief.mean(), belief.std()
     entries = {}
     for i, (name, unit) in enumerate(zip(belief.prior.names, belief.prior.units, strict=True)):
-        width = float(high[i] - low[i]) / float(prior_high[i] - prior_low[i])
+        within = min(high[i], prior_high[i]) - max(low[i], prior_low[i])
+        covered = float(within) / float(prior_high[i] - prior_low[i])
         entries[name] = {
             "mean": float(mean[i]),
             "std": float(std[i]),
             "interval_90": [float(low[i]), float(high[i])],
             "unit": unit,
-            "still_the_prior": width > STILL_PRIOR,
+            "still_the_prior": covered > STILL_PRIOR,
         }
     return {
         "parameters": entries,

@@ -31,6 +31,9 @@ NOISE_FACTOR = 6.0
 """Differences beyond this many standard deviations are not noise (1 in 5e8 for a normal)."""
 ROUNDING = 1e-6
 """Start pose and command may differ by this much [m, rad] on top of noise: printed digits."""
+NO_CONTACT = "no step shows contact beyond the noise: it tells only where nothing is"
+LEAST_FELT = 2
+"""So many rows beyond the noise are no bad reading any more."""
 FREE_WRENCH = 1e-3
 """The start wrench may differ from 0 by this much [N, N·m] on top of noise: printed digits."""
 
@@ -160,9 +163,16 @@ def check_episode(episode: Episode) -> list[str]:
     noise = episode.sensor_std.numpy()
     expected_noise = np.hypot(noise[3:], episode.stiffness.numpy() * noise[:3])
     significant = np.abs(expected) > NOISE_FACTOR * expected_noise + 1e-9
+    felt = np.abs(wrenches) > NOISE_FACTOR * expected_noise + 1e-9
     for axis, name in enumerate(WRENCH_COLUMNS):
         rows = significant[:, axis]
         if not rows.any():
+            if felt[:, axis].sum() >= LEAST_FELT:
+                largest = np.abs(wrenches[:, axis]).max()
+                warnings.append(
+                    f"{name} reaches {largest:.3g} while K (pose - command) stays within the noise;"
+                    " check the stiffness and the units"
+                )
             continue
         slope = float(
             (wrenches[rows, axis] @ expected[rows, axis]) / (expected[rows, axis] ** 2).sum()
@@ -177,8 +187,8 @@ def check_episode(episode: Episode) -> list[str]:
                 f"{name} is {slope:.2g} times K (pose - command), expected about 1; check the"
                 " stiffness, the units and whether the arm had settled"
             )
-    if not significant.any():
-        warnings.append("no step shows contact beyond the noise: nothing can be learnt from it")
+    if not significant.any() and not (felt.sum(0) >= LEAST_FELT).any():
+        warnings.append(NO_CONTACT)
     silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
     if silent:
         warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from tpcd.data.episode import Episode, locate, read_rows
+from tpcd.data.episode import Episode
+from tpcd.data.files import locate, read_rows
 from tpcd.data.header import Header, read_header
 from tpcd.data.noise import check_noise, estimate_noise
 from tpcd.errors import EpisodeError

@@ -29,7 +29,7 @@ from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.coverage import contact_rows
 from tpcd.discrepancy.diagnosis import Cell
-from tpcd.discrepancy.evidence import Fit, Question
+from tpcd.discrepancy.fit import Fit, Question
 from tpcd.effects.conditions import FLOOR, WALL, Outcome
 from tpcd.planar import wrap_angle
 from tpcd.simulator import native

@@ -13,7 +13,8 @@ from pathlib import Path
 import torch
 
 from tpcd.data.checks import check_episode
-from tpcd.data.episode import Episode, locate
+from tpcd.data.episode import Episode
+from tpcd.data.files import locate
 from tpcd.data.header import Header, read_header
 from tpcd.data.measured import read_measured
 from tpcd.data.noise import check_noise

@@ -10,7 +10,8 @@ from tpcd.belief.belief import Belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
-from tpcd.discrepancy.evidence import Fit, fit_model, posterior
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit, posterior
 from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors, typical_share
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.variants import NUMERICS, Variant

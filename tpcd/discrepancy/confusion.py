@@ -15,8 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.target import ContactTarget
+from tpcd.discrepancy.carrying import carried
 from tpcd.discrepancy.diagnosis import Confusion
-from tpcd.discrepancy.evidence import Fit, Question, carried, fit_stream
+from tpcd.discrepancy.fit import Fit, Question, fit_stream
 from tpcd.effects.protocol import Effect
 
 ALIKE = 0.95

@@ -10,13 +10,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.belief.cloud import SamplerSettings
 from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
+from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.target import ContactTarget
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import CHANNELS, Gap
-from tpcd.discrepancy.evidence import Fit, Question, fit_model, posterior
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit, Question, posterior
 from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 
@@ -29,7 +30,14 @@ LEAST_EXCESS = 0.1
 TYPICAL = 0.95
 """Share of the rows whose largest square before bounds what a number counts in what is typical."""
 FOLD_SAMPLER = SamplerSettings(
-    particles=200, draws=1000, prior_draws=100, fresh_modes=24, rounds=2, modes=12
+    particles=200,
+    places=80,
+    draws_per_place=9,
+    draws=1000,
+    prior_draws=100,
+    fresh_modes=24,
+    rounds=2,
+    modes=12,
 )
 """Budget of a fit that starts where the fit of all data arrived."""
 UNITS = ("m", "m", "rad", "N", "N", "N·m")

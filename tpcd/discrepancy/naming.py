@@ -13,7 +13,8 @@ from dataclasses import replace
 
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
-from tpcd.discrepancy.evidence import Fit, Question, fit_model
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,

@@ -14,7 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from tpcd.discrepancy.diagnosis import Candidate
-from tpcd.discrepancy.evidence import Fit, fit_model
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit
 from tpcd.discrepancy.naming import pruned
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import AMBIGUOUS, FRESH, RIVAL_SEEDS, WITHIN

@@ -17,7 +17,8 @@ from torch import Tensor
 from tpcd.belief.modes import climb, set_out
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.target import ContactTarget
-from tpcd.discrepancy.evidence import Fit, Question, carried, fit_stream
+from tpcd.discrepancy.carrying import carried
+from tpcd.discrepancy.fit import Fit, Question, fit_stream
 from tpcd.effects.protocol import Effect
 
 PLACES = 16

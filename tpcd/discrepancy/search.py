@@ -11,16 +11,17 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from tpcd.belief.belief import EstimatorSettings, misfit_field
+from tpcd.belief.belief import misfit_field
 from tpcd.belief.history import joined_history
 from tpcd.belief.prior import make_prior
 from tpcd.belief.resampling import effective_sample_size
+from tpcd.belief.settings import EstimatorSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
-from tpcd.discrepancy.coverage import coverage_of
+from tpcd.discrepancy.coverage import contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis
-from tpcd.discrepancy.evidence import TIED, Fit, Question
+from tpcd.discrepancy.fit import TIED, Fit, Question
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import better_base, find_confusions, name_one, pruned
 from tpcd.discrepancy.rivals import outdone
@@ -89,17 +90,18 @@ def _question(
 
 def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
     """Why the data cannot say anything; empty where they can."""
-    question, counts = bench.question, bench.coverage.counts
+    question = bench.question
     rows = int(question.history.used.sum())
     needed = max(FEWEST_ROWS, question.scene.dimension)
-    contact = counts["floor load"] + counts["wall load"]
+    touched = (contact_rows(episode) for episode in episodes)
+    contact = sum(int((floored | walled).sum()) for floored, walled in touched)
     if rows < needed or contact < 3:
-        found = f"{rows} transitions, {contact:.0f} of them in contact"
+        found = f"{rows} transitions, {contact} of them in contact"
         return f"{found}; a diagnosis needs {needed} transitions and 3 in contact"
     mean, p = parity_score(question.history)
     bench.tests |= {"parity": mean, "parity_p": p}
     bench.tell(
-        f"preflight: {rows} transitions, {contact:.0f} rows in contact; pose and wrench"
+        f"preflight: {rows} transitions, {contact} rows in contact; pose and wrench"
         f" disagree by {mean:.2f} times their noise (p = {p:.2g})"
     )
     free = free_space_score(episodes)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from tpcd.belief.cloud import SamplerSettings
-from tpcd.discrepancy.evidence import FIT_SAMPLER
+from tpcd.belief.settings import SamplerSettings
+from tpcd.discrepancy.fit import FIT_SAMPLER
 from tpcd.effects import CATALOGUE
 from tpcd.effects.protocol import Effect
 from tpcd.simulator import StepSettings

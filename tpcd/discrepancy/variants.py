@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from tpcd.belief.target import ContactTarget
-from tpcd.discrepancy.evidence import Fit, Question
+from tpcd.discrepancy.fit import Fit, Question
 
 SCALES = (0.5, 2.0)
 """Widens the range of the scale at its lower and its upper end: objects of hand size to tools."""

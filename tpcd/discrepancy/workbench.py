@@ -11,7 +11,8 @@ from torch import Tensor
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
 from tpcd.discrepancy.coverage import MOTIONS, Coverage
 from tpcd.discrepancy.diagnosis import Alternative, Candidate, Confusion
-from tpcd.discrepancy.evidence import TIED, Fit, Question, fit_model, joined_fit
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import TIED, Fit, Question, joined_fit
 from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.settings import (

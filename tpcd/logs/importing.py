@@ -16,7 +16,8 @@ import torch
 from jaxtyping import Float
 
 from tpcd.data.checks import FREE_WRENCH, NOISE_FACTOR, check_episode
-from tpcd.data.episode import Episode, episode_contents
+from tpcd.data.episode import Episode
+from tpcd.data.files import episode_contents
 from tpcd.data.header import SENSOR_NAMES, Header
 from tpcd.data.measured import Measured, measured_contents
 from tpcd.data.noise import check_noise

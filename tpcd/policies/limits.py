@@ -52,10 +52,8 @@ class Limits:
     def excess_probability(self, prediction: Prediction) -> Float[Tensor, " n"]:
         """Probability that each predicted transition ends with more than the force limit, at
         most (the sum over axes); 1 where the belief has no answer."""
-        offset = (prediction.component_mean - prediction.command)[..., :2]
-        stiffness = prediction.stiffness[:2]
-        mean = stiffness * offset
-        std = stiffness * prediction.component_variance[..., :2].sqrt()
+        mean, variance = (value[..., 3:5] for value in prediction.true_moments())
+        std = variance.sqrt()
         outside = torch.special.ndtr((mean - self.force) / std)
         outside = outside + torch.special.ndtr((-mean - self.force) / std)
         weights = prediction.weights.nan_to_num(0.0)

@@ -44,6 +44,8 @@ from tpcd.truth.diagnosis_motion import (
 )
 from tpcd.truth.motions import FORCE_LIMIT
 
+LARGEST_REACH = 0.5
+"""How far behind a surface a set point may lie for the force that is wanted [m]."""
 LEAST_REACH = 1e-3
 """A plan that could move by no more than this at a time is refused [m]."""
 HARD = 6.0
@@ -74,8 +76,8 @@ def diagnosis_plan(
 
     `start` is a free pose of the hand [m, m, rad], `floor_height` the z and `wall_position` the x
     of the hand where the upright object touches them [m], right within `error` [m]. The last
-    command lifts off. Raises ValueError for a start pose that is not free, or where the error
-    alone could mean too much force.
+    command lifts off. Raises ValueError for a start pose that is not free, where the error alone
+    could mean too much force, or where the arm is so soft that set points lie far inside.
     """
     x, z, angle = start.tolist()
     if z <= floor_height + error or x >= wall_position - error:
@@ -90,6 +92,12 @@ def diagnosis_plan(
         raise ValueError(
             f"error is {error:g} m, which at this stiffness alone means {FORCE_LIMIT:g} N; expected"
             f" floor and wall to be known within less than {least:g} m"
+        )
+    if max(reach) > LARGEST_REACH:
+        raise ValueError(
+            f"at a stiffness of {min(stiffness.tolist()[:2]):g} N/m a force of {FORCE_LIMIT:g} N"
+            f" needs set points {max(reach):.3g} m behind the surface, expected at most"
+            f" {LARGEST_REACH:g}; check that the stiffness is in N/m"
         )
     felt = Feel(
         x, z, (x, z, angle), floor_height, wall_position, False, False,

@@ -33,15 +33,8 @@ from tpcd.truth.injected_world import (
     floor_shape,
     world_xml,
 )
-from tpcd.truth.mujoco_truth import (
-    POINT_RADIUS,
-    MujocoSettings,
-    Transition,
-    load_mujoco,
-    ramp_and_hold,
-    scene_xml,
-    stability_check,
-)
+from tpcd.truth.mujoco_scene import POINT_RADIUS, MujocoSettings, scene_xml
+from tpcd.truth.mujoco_truth import Transition, load_mujoco, ramp_and_hold, stability_check
 from tpcd.truth.scene import Scene
 
 __all__ = ["InjectedMujocoTruth", "sensor_effects"]

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tpcd.truth.injected_effects import ActiveEffects
-from tpcd.truth.mujoco_truth import (
+from tpcd.truth.mujoco_scene import (
     INERTIAL_XML,
     POINT_RADIUS,
     MujocoSettings,

@@ -17,7 +17,8 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.data.episode import Episode, episode_contents, read_rows, write_together
+from tpcd.data.episode import Episode
+from tpcd.data.files import episode_contents, read_rows, write_together
 from tpcd.data.header import Header
 from tpcd.errors import EpisodeError
 from tpcd.truth.diagnosis_motion import diagnosis_motion

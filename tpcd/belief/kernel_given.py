@@ -1,0 +1,68 @@
+"""What the compiled likelihood is given, and where its answers go."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Measured(NamedTuple):
+    """What is known and asked of m particles over n transitions between r = n + 1 rows.
+
+    `poses` (c, r, 3) and their `variance`, the same for all particles (c = 1) or one for each;
+    `give` (c, r, 3) is that of `Conditions`. Values and `slopes` (n, j) of the bumps; `rest` (c, n)
+    what the terms after each one can still add; `least` (m) what must be reached; `sd` (m) of the
+    misfit; `used` (n) says which transitions count: the others part the history. `limit` of an
+    innovation's square; by more than `far` [m] a gap has its transition stepped again.
+    """
+
+    poses: np.ndarray
+    variance: np.ndarray
+    give: np.ndarray
+    bumps: np.ndarray
+    slopes: np.ndarray
+    rest: np.ndarray
+    least: np.ndarray
+    sd: np.ndarray
+    used: np.ndarray
+    limit: float
+    far: float
+
+
+class Given(NamedTuple):
+    """What the arm is asked and what it meets, for m particles and r rows, or 1 of either.
+
+    `commands` and `stiffness` (.., .., 3); `turns` (.., .., 1) the angle of the object in the
+    hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` (.., .., t).
+    """
+
+    commands: np.ndarray
+    stiffness: np.ndarray
+    turns: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    friction: np.ndarray
+    substeps: int
+    finest: float
+    largest_turn: float
+    follow_path: bool
+
+
+class Found(NamedTuple):
+    """Where the answers go: log likelihood (m), field mean (m, c) and covariance (m, c, c),
+    innovations and the logarithms of their units (m, n, 3) where they are asked for (else m = 0),
+    and derivatives (m, d, n, 3) of the innovations by d entries of theta. `poses` (m, n, 3),
+    `modes` (m, n, t) and `contacts` (m, n, t, 4) of the settled steps where they are asked for.
+    """
+
+    total: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    jammed: np.ndarray
+    whitened: np.ndarray
+    log_scale: np.ndarray
+    slopes: np.ndarray
+    poses: np.ndarray
+    modes: np.ndarray
+    contacts: np.ndarray

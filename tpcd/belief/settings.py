@@ -1,0 +1,116 @@
+"""Choices of the default estimator: its model, and how many draws it may spend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from tpcd.effects.protocol import Effect
+from tpcd.simulator import StepSettings
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """Budget of the sampler for one datum; by default what choosing the next move needs."""
+
+    particles: int = 700
+    """Particles kept of all draws."""
+    places: int = 70
+    """Places that each round of importance sampling puts components at."""
+    draws_per_place: int = 5
+    """Draws at each place."""
+    rounds: int = 3
+    """Rounds of importance sampling that shape the mixture."""
+    draws: int = 1500
+    """Draws from the mixture that the rounds arrived at, which are weighted."""
+    prior_draws: int = 1500
+    """Draws from the prior at the first datum, falling as 1 / k with datum k."""
+    modes: int = 12
+    """Modes that are remembered from datum to datum."""
+    fresh_modes: int = 30
+    """Points that set out to climb to a mode at each datum."""
+    climbing_rounds: int = 2
+    """Newton steps before the lower half of those gives up."""
+    following_rounds: int = 3
+    """Newton steps of the modes that are remembered, and of those that did not give up."""
+
+    def __post_init__(self) -> None:
+        """Refuse budgets without meaning."""
+        least = {
+            "particles": 16,
+            "places": 1,
+            "draws_per_place": 1,
+            "rounds": 1,
+            "draws": 100,
+            "prior_draws": 1,
+            "modes": 1,
+            "fresh_modes": 1,
+            "climbing_rounds": 0,
+            "following_rounds": 0,
+        }
+        for name, limit in least.items():
+            if not getattr(self, name) >= limit:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
+
+
+CLOSING_SAMPLER = SamplerSettings(
+    places=320, draws_per_place=9, draws=12_000, modes=80, fresh_modes=480
+)
+"""Budget of the belief that is left once no more data are to come."""
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """Choices of the default estimator."""
+
+    sampler: SamplerSettings = field(default_factory=SamplerSettings)
+    """Budget of the sampler after each transition."""
+    closing: SamplerSettings = CLOSING_SAMPLER
+    """Budget once no more data are to come (see `refine`), for as many particles as the other."""
+    closing_passes: int = 4
+    """Times at most that the closing draws are made, each from where the one before arrived."""
+    closing_worth: float = 1000.0
+    """Effective sample size with which they need not be made again."""
+    power: float = 0.7
+    """Power to which the likelihood is raised. At 1 the posterior is as narrow as a true model and
+    endless draws would make it, and holds too few of the true values (coarsened posteriors: Miller
+    and Dunson 2019; Grünwald and van Ommen 2017)."""
+    step: StepSettings = field(default_factory=StepSettings)
+    """The quasi-static model."""
+    misfit_sd: float | None = None
+    """Median of the standard deviation of the outline misfit [m] before any datum; None takes
+    the shape model's own figure."""
+    misfit_spread: float = 1.0
+    """Standard deviation of the logarithm of that standard deviation; 0 makes it known."""
+    misfit_width: float = 0.15
+    """How far the object turns until the outline error is another one [rad]."""
+    least_misfit_sd: float = 1e-4
+    """The median is never taken to be less than this [m]."""
+    effects: tuple[Effect, ...] = ()
+    """Effects that the model has besides, whose parameters are estimated with theta."""
+    effect_draws: int = 3
+    """Times as many draws where there are effects: with what was missing in the model the
+    posterior is narrower, and its best modes are missed more easily."""
+
+    def __post_init__(self) -> None:
+        """Refuse choices without meaning."""
+        if not 0 < self.power <= 1:
+            raise ValueError(f"power is {self.power}, expected more than 0 and at most 1")
+        if not self.closing_passes >= 1:
+            raise ValueError(f"closing_passes is {self.closing_passes}, expected at least 1")
+        if not self.closing_worth >= 0:
+            raise ValueError(f"closing_worth is {self.closing_worth}, expected at least 0")
+
+    @property
+    def budget(self) -> SamplerSettings:
+        """Of the sampler, for the model with its effects."""
+        return replace(self.sampler, draws=self._more * self.sampler.draws)
+
+    @property
+    def closing_budget(self) -> SamplerSettings:
+        """The same once all data are in."""
+        draws = self._more * self.closing.draws
+        return replace(self.closing, particles=self.sampler.particles, draws=draws)
+
+    @property
+    def _more(self) -> int:
+        return self.effect_draws if self.effects else 1

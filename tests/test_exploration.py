@@ -21,8 +21,9 @@ from tpcd.commands.exploration_run import Kept, Stopping, expected_error, run_ex
 from tpcd.data.episode import Episode
 from tpcd.data.files import read_episode
 from tpcd.exploration import Estimator, ExplorationStep, explore
-from tpcd.policies import ActivePolicy, ActiveSettings, Limits, Policy, make_policy
+from tpcd.policies import ActivePolicy, ActiveSettings, Limits, Policy, Situation, make_policy
 from tpcd.policies.active import Task
+from tpcd.policies.protocol import Choice
 from tpcd.robot.protocol import Robot
 from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
@@ -153,6 +154,18 @@ def test_it_stops_before_a_move_that_promises_too_little(scene: Scene) -> None:
     belief = first.estimation.belief
     assert Stopping(steps=5).reason(belief, 1, None) is None
     assert Stopping(steps=1).reason(belief, 1, None) == "all 1 moves are made"
+
+
+def test_letting_go_of_a_forbidden_load_is_no_reason_to_stop(scene: Scene) -> None:
+    """One move is forced upon the policy, after which it sees nothing worth a move."""
+
+    class Forced:
+        def choose(self, situation: Situation, generator: torch.Generator) -> Choice:
+            here = situation.episode.poses[-1]
+            return Choice(here, gain=0.0, forced=len(situation.episode) == 1)
+
+    steps = list(explore(robot_in(scene), Forced(), estimator_of("default"), 4, least_gain=0.1))
+    assert len(steps) == 1
 
 
 ARGUMENTS = ("--outline", "soup_can", "--prior", PRIOR, "--truth", "quasistatic")

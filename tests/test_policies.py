@@ -174,16 +174,59 @@ def test_a_lower_force_limit_holds_the_hand_back(belief: Belief, episode: Episod
     """The floor is uncertain by 40 mm: pressing deep is informative and forbidden."""
     known = known_but(belief, "floor_height")
     start = row_at(episode, (0.0, 0.13, 0.0))
+    heights = {}
     for force in (8.0, 1.0):
-        limits = Limits(force=8.0, step=(0.08, 0.08, 0.01))
-        limits = replace(limits, force=force) if force == 8.0 else Limits(
-            force=force, step=(0.08, 0.08, 0.01)
-        )  # fmt: skip
+        limits = Limits(force=force, step=(0.08, 0.08, 0.01))
         choice = ActivePolicy(limits, SMALL).choose(
             Situation(start, known), torch.Generator().manual_seed(0)
         )
-        assert choice.excess_probability is not None
-        assert choice.excess_probability <= limits.probability
+        answer = ContactPredictor(known).predict(start.poses, choice.command[None])
+        wrench = 100.0 * (answer.component_mean - choice.command)[:, 0, :2]
+        share = float(answer.weights[:, 0] @ (wrench.abs() > force).any(-1).double())
+        # The choice was made by fewer particles than these.
+        assert share <= 2 * limits.probability
+        assert choice.excess_probability == pytest.approx(share, abs=limits.probability)
+        assert not choice.forced
+        heights[force] = float(choice.command[1])
+    assert heights[1.0] > heights[8.0] + 0.005
+
+
+def test_a_goal_beyond_one_step_is_judged_by_the_step_that_is_made(
+    belief: Belief, episode: Episode
+) -> None:
+    known = known_but(belief, "floor_height")
+    start = row_at(episode, (0.0, 0.11, 0.0))
+    limits = Limits(force=2.0, step=(0.02, 0.02, 0.01))
+    policy, situation = ActivePolicy(limits, SMALL), Situation(start, known)
+    goals = torch.tensor([[0.0, 0.17, 0.0], [0.0, -0.01, 0.0]], dtype=torch.float64)
+    predictor = ContactPredictor(known)
+    first, away = policy._first_step(situation, goals)
+    assert away.tolist() == pytest.approx([3.0, 6.0])
+
+    def excess_of(commands: Tensor) -> Tensor:
+        starts = start.poses.expand(2, 3)
+        noise = episode.sensor_std[:3]
+        return limits.excess_probability(predictor.predict(starts, commands, starts, noise))
+
+    _, excess = policy._rate(predictor, situation, goals)
+    torch.testing.assert_close(excess, excess_of(first))
+    assert float(excess_of(goals)[1]) > float(excess[1]) + 0.05
+
+
+def test_where_nothing_but_staying_is_allowed_the_choice_says_so(
+    belief: Belief, episode: Episode
+) -> None:
+    """A hand that is pressed down on a floor nobody knows: no command keeps the limit surely."""
+    known = known_but(belief, "floor_height")
+    limits = Limits(force=1e-6)
+    for policy in (
+        ActivePolicy(limits, SMALL),
+        GridPolicy(MotionPolicy(lambda: press_and_slide(None)), limits),
+    ):
+        choice = policy.choose(
+            Situation(row_at(episode, (0.0, -0.05, 0.0)), known), torch.Generator().manual_seed(0)
+        )
+        assert choice.forced
 
 
 def test_the_search_goes_down_for_the_floor_and_right_for_the_wall(

@@ -110,6 +110,9 @@ def explore(
 ) -> Iterator[ExplorationStep]:
     """Explore until the best command promises less than `least_gain`, or the caller has enough.
 
+    Where the limits allow nothing but to stay, and so to let go of all force, the arm does that
+    whatever it promises.
+
     With `episode`, `belief` and `state` of an exploration that was stopped it goes on after
     their rows, with the very choices it would have made; rows that were measured but not yet
     learnt from come first. `on_row` is given all rows as soon as the last one is measured. Raises
@@ -133,7 +136,7 @@ def explore(
         started = time.perf_counter()
         choice = policy.choose(Situation(episode, belief), stream(seed, _POLICY_STREAM, row))
         seconds = time.perf_counter() - started
-        if choice.gain is not None and choice.gain < least_gain:
+        if choice.gain is not None and choice.gain < least_gain and not choice.forced:
             return
         reading = robot.settle(choice.command)
         episode = episode.with_row(choice.command, reading.pose, reading.wrench)

@@ -117,7 +117,8 @@ class ActivePolicy:
             gain = gain + self._second_gain(situation, finalists, generator)
         best = best_within(gain, excess, allowed)
         command = self._first_step(situation, finalists)[0][best]
-        return Choice(command, float(gain[best]), len(goals), float(excess[best]))
+        forced = not bool((excess[:-1] <= allowed).any())
+        return Choice(command, float(gain[best]), len(goals), float(excess[best]), forced)
 
     def _second_gain(
         self, situation: Situation, goals: Tensor, generator: torch.Generator

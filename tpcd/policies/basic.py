@@ -86,8 +86,11 @@ class GridPolicy:
         )
         gain = grid_gain(prediction, self._settings)
         excess = self._limits.excess_probability(prediction)
-        best = best_within(gain, excess, self._limits.probability)
-        return Choice(commands[best], float(gain[best]), len(commands) - 1, float(excess[best]))
+        allowed = self._limits.probability
+        best, forced = best_within(gain, excess, allowed), not bool((excess[:-1] <= allowed).any())
+        return Choice(
+            commands[best], float(gain[best]), len(commands) - 1, float(excess[best]), forced
+        )
 
 
 def within(commands: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -33,6 +33,9 @@ class Choice:
     """Commands that were compared."""
     excess_probability: float | None = None
     """Probability, in the belief, that the command exceeds the force limit."""
+    forced: bool = False
+    """Whether the limits allow nothing but to stay, or not even that: then the gain says nothing
+    of what is left to learn."""
     asked: Float[Tensor, " 3"] | None = None
     """What a script asked for, where the limits drew it back [m, m, rad]."""
 

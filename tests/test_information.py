@@ -68,6 +68,27 @@ def test_the_gain_in_a_linear_normal_model_is_the_closed_form() -> None:
     torch.testing.assert_close(found, expected, atol=0.03, rtol=0.03)
 
 
+@pytest.mark.parametrize("power", [0.5, 0.8])
+def test_the_gain_of_a_belief_that_takes_likelihoods_to_a_power(power: float) -> None:
+    """theta ~ N(0, I) becomes N(m, C) with C^-1 = I + p A^T A / s^2 and m = p C A^T y / s^2, where
+    y still has the variance A A^T + s^2 I; its divergence from N(0, I) is averaged over y."""
+    theta = torch.randn(2500, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    matrices, one = sensitivities(), torch.eye(2, dtype=torch.float64)
+    task, scale = torch.tensor([[1.0, 0.5]], dtype=torch.float64), torch.ones(1).double()
+    outcomes = replace(linear_outcomes(theta, matrices, 0.5), power=power)
+    found = expected_information_gain(outcomes)
+    variance = expected_variance(outcomes, theta @ task.T, scale)
+    for c, matrix in enumerate(matrices):
+        after = torch.linalg.inv(one + power * matrix.T @ matrix / 0.5**2)
+        answer = power * after @ matrix.T / 0.5**2
+        outcome = matrix @ matrix.T + 0.5**2 * torch.eye(3, dtype=torch.float64)
+        mean = answer @ outcome @ answer.T
+        expected = 0.5 * (after.trace() + mean.trace() - 2 - after.logdet())
+        assert float(found[c]) == pytest.approx(float(expected), abs=0.03, rel=0.03)
+        left = float(task @ after @ task.T)
+        assert float(variance[c]) == pytest.approx(left, rel=0.06)
+
+
 def test_the_gain_agrees_with_nested_monte_carlo() -> None:
     """Outcomes drawn at random from a mixture, each weighed against all components."""
     outcomes = random_outcomes(12, 3, 2)
@@ -106,6 +127,11 @@ def test_pairs_hold_the_normal_log_density() -> None:
     torch.testing.assert_close(share.sum(-1), torch.ones(2, dtype=torch.float64))
 
 
+def _of_particles(outcomes: Outcomes, index: Tensor) -> Outcomes:
+    parts = (outcomes.mean, outcomes.factor, outcomes.weights)
+    return Outcomes(*(part[:, index] for part in parts))
+
+
 @settings(deadline=None, max_examples=25)
 @given(m=st.integers(2, 30), seed=st.integers(0, 10_000))
 def test_permuting_or_splitting_particles_changes_nothing(m: int, seed: int) -> None:
@@ -113,9 +139,9 @@ def test_permuting_or_splitting_particles_changes_nothing(m: int, seed: int) -> 
     values = torch.randn(m, 3, generator=torch.Generator().manual_seed(seed)).double()
     scale = torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
     order = torch.randperm(m, generator=torch.Generator().manual_seed(seed))
-    turned = Outcomes(*(part[:, order] for part in vars(outcomes).values()))
+    turned = _of_particles(outcomes, order)
     twice = torch.cat((torch.arange(m), torch.arange(m)))
-    split = Outcomes(*(part[:, twice] for part in vars(outcomes).values()))
+    split = _of_particles(outcomes, twice)
     split = replace(split, weights=split.weights / 2)
     gain = expected_information_gain(outcomes)
     assert (gain >= 0).all()

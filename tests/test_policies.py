@@ -57,6 +57,20 @@ def belief(episode: Episode) -> Belief:
     return prior_belief(episode, load_prior("ycb21-z2"), generator, settings)
 
 
+def test_what_is_expected_to_be_learnt_counts_as_what_is_learnt_does(
+    belief: Belief, episode: Episode
+) -> None:
+    start, down = row_at(episode, (0.0, 0.15, 0.0)), torch.tensor([[0.0, 0.0, 0.0]]).double()
+
+    def expected(power: float) -> float:
+        predictor = ContactPredictor(replace(belief, power=power), 60)
+        here = (start.poses[0], down, start.commands[0], episode.sensor_std)
+        return float(expected_information_gain(belief_outcomes(predictor, *here)[0]))
+
+    assert belief.power == EstimatorSettings().power
+    assert 0.1 < expected(0.3) < 0.95 * expected(1.0)
+
+
 def test_what_limits_draw_back_is_told(episode: Episode, belief: Belief) -> None:
     wide = Limits(50.0, (1.0, 1.0, 1.0), (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     narrow = replace(wide, low=(-1.0, 0.06, -1.0))

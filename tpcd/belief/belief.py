@@ -65,6 +65,8 @@ class Belief:
     """Of the likelihood to the power of `EstimatorSettings.power`."""
     log_evidence_std: float
     """Its standard error over the draws."""
+    power: float = 1.0
+    """To which the likelihood of each datum counts, also of those to come."""
 
     @property
     def parameters(self) -> Parameters:
@@ -171,6 +173,7 @@ def prior_belief(
         stiffness=episode.stiffness.double(),
         log_evidence=0.0,
         log_evidence_std=0.0,
+        power=target.power,
     )
 
 
@@ -200,4 +203,5 @@ def belief_of(cloud: Cloud, target: ContactTarget) -> Belief:
         stiffness=target.history.stiffness,
         log_evidence=cloud.log_evidence,
         log_evidence_std=cloud.log_evidence_std,
+        power=target.power,
     )

@@ -71,9 +71,9 @@ class EstimatorSettings:
     closing_worth: float = 1000.0
     """Effective sample size with which they need not be made again."""
     power: float = 0.7
-    """Power to which the likelihood is raised. At 1 the posterior is as narrow as a true model and
-    endless draws would make it, and holds too few of the true values (coarsened posteriors: Miller
-    and Dunson 2019; Grünwald and van Ommen 2017)."""
+    """Power to which the likelihood is raised (coarsened posteriors: Miller and Dunson 2019;
+    Grünwald and van Ommen 2017). At 1 the posterior is Bayes' own, which holds what it says where
+    the model is true (`eval.calibration`), and too little on real outlines (`eval.unseen`)."""
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""
     misfit_sd: float | None = None

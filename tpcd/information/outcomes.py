@@ -29,6 +29,8 @@ class Outcomes:
     """Cholesky factors of the covariances, lower triangular."""
     weights: Float[Tensor, "c m"]
     """Weights of the particles for each command, which sum to 1."""
+    power: float = 1.0
+    """To which the likelihood of what is read will count (`Belief.power`)."""
 
 
 def belief_outcomes(
@@ -54,7 +56,8 @@ def belief_outcomes(
     if bool(none.any()):
         mean = torch.where(none[:, None, None], 0.0, mean)
         weights = torch.where(none[:, None], 1.0 / weights.shape[1], weights)
-    return Outcomes(mean, torch.linalg.cholesky(covariance), weights), prediction
+    factor = torch.linalg.cholesky(covariance)
+    return Outcomes(mean, factor, weights, predictor.belief.power), prediction
 
 
 def reading_variance(

@@ -40,6 +40,25 @@ CHANGES: dict[str, tuple[str, object, str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("fresh", [False, True], ids=["episode", "fresh"])
+def test_a_force_of_the_wrong_sign_is_no_gap_to_name(
+    axis: int, fresh: bool, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = episode_of(0)
+    signs = torch.ones(3, dtype=torch.float64)
+    signs[axis] = -1.0
+    wrong = write_episode(replace(good, wrenches=signs * good.wrenches), tmp_path / "wrong.csv")
+    words = (str(folder / "a.csv"), "--fresh", str(wrong)) if fresh else (str(wrong),)
+    code = call("diagnose", *words, "--prior", PRIOR, "--out", str(tmp_path / "run"))
+    error = capsys.readouterr().err.strip()
+    name = ("F_x", "F_z")[axis]
+    assert code == 2 and "\n" not in error
+    assert f"{wrong}: {name} looks inverted" in error
+    assert f"change the sign of the column {name}" in error
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("case", CHANGES)
 @pytest.mark.parametrize("fresh", [False, True], ids=["episode", "fresh"])
 def test_set_ups_are_not_mixed(

@@ -32,6 +32,8 @@ NOISE_FACTOR = 6.0
 ROUNDING = 1e-6
 """Start pose and command may differ by this much [m, rad] on top of noise: printed digits."""
 NO_CONTACT = "no step shows contact beyond the noise: it tells only where nothing is"
+INVERTED = -0.3
+"""A wrench that is less than this many times K (pose - command) has the opposite sign."""
 LEAST_FELT = 2
 """So many rows beyond the noise are no bad reading any more."""
 FREE_WRENCH = 1e-3
@@ -156,32 +158,19 @@ def check_episode(episode: Episode) -> list[str]:
     sign or another size speak for a sign or unit error of the sensor or of the stiffness.
     """
     warnings = []
-    wrenches = episode.wrenches.numpy()
-    deviations = (episode.poses - episode.commands).numpy()
-    deviations[:, 2] = [math.remainder(angle, 2 * math.pi) for angle in deviations[:, 2]]
-    expected = deviations * episode.stiffness.numpy()
-    noise = episode.sensor_std.numpy()
-    expected_noise = np.hypot(noise[3:], episode.stiffness.numpy() * noise[:3])
-    significant = np.abs(expected) > NOISE_FACTOR * expected_noise + 1e-9
-    felt = np.abs(wrenches) > NOISE_FACTOR * expected_noise + 1e-9
-    for axis, name in enumerate(WRENCH_COLUMNS):
-        rows = significant[:, axis]
-        if not rows.any():
+    noise, largest_wrench = episode.sensor_std.numpy(), np.abs(episode.wrenches.numpy()).max(0)
+    significant, felt = _beyond_noise(episode)
+    for axis, (name, slope) in enumerate(wrench_slopes(episode).items()):
+        if slope is None:
             if felt[:, axis].sum() >= LEAST_FELT:
-                largest = np.abs(wrenches[:, axis]).max()
+                largest = largest_wrench[axis]
                 warnings.append(
                     f"{name} reaches {largest:.3g} while K (pose - command) stays within the noise;"
                     " check the stiffness and the units"
                 )
             continue
-        slope = float(
-            (wrenches[rows, axis] @ expected[rows, axis]) / (expected[rows, axis] ** 2).sum()
-        )
-        if slope < -0.3:
-            warnings.append(
-                f"{name} looks inverted: it is {slope:.2f} times K (pose - command); expected is"
-                " what the world exerts on the object, so pressing on the floor gives F_z > 0"
-            )
+        if slope < INVERTED:
+            warnings.append(inverted_sentence(name, slope))
         elif not 0.5 < slope < 2.0:
             warnings.append(
                 f"{name} is {slope:.2g} times K (pose - command), expected about 1; check the"
@@ -193,3 +182,37 @@ def check_episode(episode: Episode) -> list[str]:
     if silent:
         warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")
     return warnings
+
+
+def wrench_slopes(episode: Episode) -> dict[str, float | None]:
+    """How many times K (pose - command) each channel of the wrench is, over the rows in which that
+    is beyond the noise; None where there is none."""
+    significant, _ = _beyond_noise(episode)
+    wrenches, expected = episode.wrenches.numpy(), _expected_wrenches(episode)
+    slopes: dict[str, float | None] = {}
+    for axis, name in enumerate(WRENCH_COLUMNS):
+        rows = significant[:, axis]
+        there, here = wrenches[rows, axis], expected[rows, axis]
+        slopes[name] = float((there @ here) / (here**2).sum()) if rows.any() else None
+    return slopes
+
+
+def inverted_sentence(name: str, slope: float) -> str:
+    """What is said of a channel that looks inverted."""
+    return (
+        f"{name} looks inverted: it is {slope:.2f} times K (pose - command); expected is"
+        " what the world exerts on the object, so pressing on the floor gives F_z > 0"
+    )
+
+
+def _expected_wrenches(episode: Episode) -> np.ndarray:
+    deviations = (episode.poses - episode.commands).numpy()
+    deviations[:, 2] = [math.remainder(angle, 2 * math.pi) for angle in deviations[:, 2]]
+    return deviations * episode.stiffness.numpy()
+
+
+def _beyond_noise(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+    """Entries (n, 3) of K (pose - command), and of the wrench, that are no noise."""
+    noise = episode.sensor_std.numpy()
+    limit = NOISE_FACTOR * np.hypot(noise[3:], episode.stiffness.numpy() * noise[:3]) + 1e-9
+    return np.abs(_expected_wrenches(episode)) > limit, np.abs(episode.wrenches.numpy()) > limit

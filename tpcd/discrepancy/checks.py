@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from tpcd.data.checks import check_episode
+from tpcd.data.checks import INVERTED, check_episode, inverted_sentence, wrench_slopes
 from tpcd.data.episode import Episode
 from tpcd.data.files import locate
 from tpcd.data.header import Header, read_header
@@ -44,8 +44,9 @@ class Data:
 def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
     """Read and check the episodes of a diagnosis.
 
-    Raises `EpisodeError` for files that cannot be read, for episodes of different set-ups, and for
-    noise that is plainly wrong, or neither stated nor shown by the data.
+    Raises `EpisodeError` for files that cannot be read, for episodes of different set-ups, for a
+    force of the opposite sign, which no effect makes but many can be fitted to, and for noise
+    that is plainly wrong, or neither stated nor shown by the data.
     """
     places = [locate(Path(path)) for path in (*paths, *fresh)]
     headers = [read_header(header) for _, header in places]
@@ -54,11 +55,21 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
         if not header.commands_known:
             return Data((), (), answer=_without_commands(table, header))
     episodes, notes = read_noisy((*paths, *fresh))
+    for (table, _), episode in zip(places, episodes, strict=True):
+        _check_signs(table, episode)
     told = [line for episode in episodes for line in check_noise(episode)]
     warnings = [line for episode in episodes for line in check_episode(episode)]
     count = len(paths)
     given, noted = one_noise(episodes[:count])
     return Data(given, tuple(episodes[count:]), (*notes, *noted, *told), tuple(warnings))
+
+
+def _check_signs(path: Path, episode: Episode) -> None:
+    # A torque may turn with the point that it is about, which a diagnosis can name.
+    for name, slope in list(wrench_slopes(episode).items())[:2]:
+        if slope is not None and slope < INVERTED:
+            remedy = f"change the sign of the column {name}, or of its frame"
+            raise EpisodeError(path, inverted_sentence(name, slope), remedy)
 
 
 def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:

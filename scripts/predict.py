@@ -18,7 +18,7 @@ class Predict:
     episodes: tuple[Path, ...]
     """Episodes to predict, one or more."""
     out: Path
-    """CSV file for the predictions."""
+    """File for the predictions, .csv or .parquet."""
     model: Path | None = None
     """A model.yaml whose effects join the belief, drawn from what it says was found."""
     rollout: bool = False
@@ -55,6 +55,7 @@ def predict_episodes(config: Predict) -> None:
         write_prediction,
     )
     from tpcd.data import read_episode
+    from tpcd.data.files import TABLE_SUFFIXES
     from tpcd.errors import RunError
     from tpcd.predict import ContactPredictor
     from tpcd.results import check_target, format_table
@@ -64,6 +65,8 @@ def predict_episodes(config: Predict) -> None:
     episodes = [read_episode(path) for path in config.episodes]
     read = [episode.path for episode in episodes if episode.path is not None]
     check_target(config.out, config.overwrite, read)
+    if config.out.suffix not in TABLE_SUFFIXES:
+        raise RunError(config.out, "is no .csv or .parquet", "choose a name that ends so")
     model = model_of(config.model)
     belief = load_belief(config.run)
     for warning in run_warnings(config.run, episodes):

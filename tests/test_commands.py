@@ -8,12 +8,14 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from command_calls import PRIOR, call, make_world
 
 from tpcd.belief.storage import load_belief
 from tpcd.data import read_episode, write_episode
+from tpcd.data.table import read_table
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,21 @@ def test_predictions_have_a_row_for_each_step(
             assert float(row[f"{name}_sd"]) > 0
     printed = capsys.readouterr().out
     assert "coverage_90" in printed and "mae" in printed
+
+
+def test_predictions_are_a_table_of_the_kind_that_is_named(world: Path, tmp_path: Path) -> None:
+    episodes = (str(world / "test.csv"), str(world / "explore.csv"))
+    tables = {}
+    for suffix in ("csv", "parquet"):
+        out = tmp_path / f"p.{suffix}"
+        assert call("predict", str(world / "run"), *episodes, "--out", str(out)) == 0
+        tables[suffix] = read_table(out, ("episode", "step", "x_mean", "tau_q95"))
+    assert list(tables["csv"]) == list(tables["parquet"])
+    for name, column in tables["csv"].items():
+        assert column.tolist() == tables["parquet"][name].tolist()
+    lengths = [len(read_episode(path)) - 1 for path in episodes]
+    assert np.bincount(tables["csv"]["episode"].astype(int)).tolist() == lengths
+    assert tables["csv"]["step"].tolist() == [k + 1 for n in lengths for k in range(n)]
 
 
 def test_predictions_of_a_stopped_run_or_an_inverted_sensor_are_warned_of(

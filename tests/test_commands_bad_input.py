@@ -143,6 +143,7 @@ PREDICT = {
     "no particles": (("run",), {"--particles": "0"}, "particles is 0, expected at least 1"),
     "folder in the way": (("run",), {"--out": "run"}, "run: is a folder"),
     "file in the way": (("run",), {"--out": "run/belief.json"}, "run/belief.json: exists already"),
+    "no table": (("run",), {"--out": "p.txt"}, "p.txt: is no .csv or .parquet"),
     "its own input": (("run",), {"--out": "test.csv"}, "test.csv: is what the command reads"),
     "below a file": (("run",), {"--out": "test.csv/p.csv"}, "test.csv is a file"),
     "misspelt choice": (("run",), {"--of": "treu"}, "found 'treu', expected one of"),

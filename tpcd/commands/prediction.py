@@ -7,13 +7,12 @@ read (the episode's noise included) or of what is true, as asked.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,7 +20,8 @@ from torch import Tensor
 from tpcd.commands.estimation import STEPS_FILE
 from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
-from tpcd.files import write_text
+from tpcd.data.files import write_together
+from tpcd.data.table import encode_table
 from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 from tpcd.prediction import CHANNELS, Prediction
@@ -144,21 +144,20 @@ def score_rows(predicted: PredictedRows, rows: Float[Tensor, "n 6"]) -> list[dic
 
 
 def write_prediction(predicted: list[PredictedRows], path: Path) -> None:
-    """Write predictions of one or several episodes as CSV in one move.
+    """Write predictions of one or several episodes in one move, as CSV or, where the path ends
+    so, Parquet.
 
     Columns `step`, then mean, sd, q05 and q95 of each channel; with several episodes a first
     column `episode` counts them from 0.
     """
-    header = ["episode"] if len(predicted) > 1 else []
-    header += ["step"]
-    for name in CHANNELS:
-        header += [f"{name}_{what}" for what in ("mean", "sd", "q05", "q95")]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for number, rows in enumerate(predicted):
-        table = torch.stack((rows.mean, rows.std, rows.low, rows.high), dim=-1).flatten(1)
-        for step, values in enumerate(table.tolist(), start=1):
-            lead = [number, step] if len(predicted) > 1 else [step]
-            writer.writerow([*lead, *(repr(value) for value in values)])
-    write_text(path, text.getvalue())
+    counts = [len(rows.mean) for rows in predicted]
+    table: dict[str, np.ndarray] = {}
+    if len(predicted) > 1:
+        table["episode"] = np.repeat(np.arange(len(counts)), counts)
+    table["step"] = np.concatenate([np.arange(1, count + 1) for count in counts])
+    parts = [(rows.mean, rows.std, rows.low, rows.high) for rows in predicted]
+    values = torch.cat([torch.stack(part, dim=-1) for part in parts]).numpy()
+    for channel, name in enumerate(CHANNELS):
+        for i, what in enumerate(("mean", "sd", "q05", "q95")):
+            table[f"{name}_{what}"] = values[:, channel, i]
+    write_together({path: encode_table(table, path)})

@@ -35,7 +35,8 @@ class Estimate:
     """Replace an earlier run in the folder."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, least={"particles": 16}, above={"misfit": 0.0})
+        above, most = {"misfit": 0.0}, {"misfit": 0.05}
+        check_numbers(self, least={"particles": 16}, above=above, most=most)
         if self.model is not None and self.estimator == "paper":
             raise ValueError("the estimator paper has a model of its own; leave --model out")
 

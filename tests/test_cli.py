@@ -166,11 +166,13 @@ class Limited:
 
     count: int = 3
     misfit: float | None = None
+    corner: tuple[float, float] = (-1.0, 1.0)
     stiffness: tuple[float, ...] = (1.0, 2.0)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_numbers(self, least={"count": 1}, above={"misfit": 0.0, "stiffness": 0.0})
+        above = {"misfit": 0.0, "stiffness": 0.0}
+        check_numbers(self, least={"count": 1}, above=above, most={"misfit": 0.05, "corner": 5.0})
 
 
 @pytest.mark.parametrize(
@@ -178,6 +180,8 @@ class Limited:
     [
         ({"count": 0}, "count is 0, expected at least 1"),
         ({"misfit": 0.0}, "misfit is 0, expected more than 0"),
+        ({"misfit": 0.5}, "misfit is 0.5, expected at most 0.05; lengths are in m"),
+        ({"corner": (0.1, -300.0)}, "corner is -300, expected at most 5; lengths are in m"),
         ({"misfit": float("nan")}, "misfit is nan, expected a finite number"),
         ({"stiffness": (1.0, -2.0)}, "stiffness is -2, expected more than 0"),
         ({"seed": -1}, "seed is -1, expected 0 to"),

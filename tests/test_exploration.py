@@ -217,6 +217,7 @@ def test_the_command_explores_stops_and_goes_on(
         (("--policy", "expert", "--stop_gain", "1"), "stop_gain needs a policy"),
         (("--force_limit", "0"), "force_limit"),
         (("--step_limit", "0", "0", "0"), "step"),
+        (("--step_limit", "80", "80", "0.3"), "step_limit is 80, expected at most 5"),
         (("--workspace_low", "1", "1", "1"), "workspace"),
         (("--policy", "brave"), "policy"),
         (("--task", "nowhere.csv"), "nowhere.csv"),

@@ -137,12 +137,14 @@ def check_numbers(
     config: object,
     least: Mapping[str, int | float] | None = None,
     above: Mapping[str, int | float] | None = None,
+    most: Mapping[str, float] | None = None,
 ) -> None:
-    """Refuse fields of a configuration that are too small, not finite, or no usable seed.
+    """Refuse fields of a configuration that are too small or large, not finite, or no usable seed.
 
     For `__post_init__`: `least` and `above` map names of fields to limits, inclusive and
-    exclusive; every other number must be finite. A tuple is checked value by value, None
-    passes. Raises `ValueError` that names the field, what was found and what is expected.
+    exclusive, `most` to what a quantity in SI units can be at most; every other number must be
+    finite. A tuple is checked value by value, None passes. Raises `ValueError` that names the
+    field, what was found and what is expected.
     """
     for name, field in vars(config).items():
         for value in field if isinstance(field, tuple) else (field,):
@@ -154,6 +156,9 @@ def check_numbers(
                 raise ValueError(f"{name} is {value:g}, expected at least {least[name]:g}")
             if above and name in above and value <= above[name]:
                 raise ValueError(f"{name} is {value:g}, expected more than {above[name]:g}")
+            if most and name in most and abs(value) > most[name]:
+                limit = f"expected at most {most[name]:g}; lengths are in m, angles in rad"
+                raise ValueError(f"{name} is {value:g}, {limit}")
             if name in ("seed", "seeds") and not 0 <= value <= LARGEST_SEED:
                 raise ValueError(f"{name} is {value}, expected 0 to {LARGEST_SEED}")
 

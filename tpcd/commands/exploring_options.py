@@ -10,6 +10,9 @@ from tpcd.cli import check_numbers
 
 WEIGHING = ("active", "lookahead", "grid")
 """Policies that weigh commands against each other."""
+EXTENTS = ("step_limit", "workspace_low", "workspace_high")
+LARGEST_EXTENT = 5.0
+"""What is asked for beyond this [m, rad] is taken for millimetres or degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +57,8 @@ class ExploringOptions:
         check_numbers(
             self,
             least={"steps": 1},
-            above={"force_limit": 0.0, "stop_gain": 0.0, "stop_error": 0.0},
+            above={"force_limit": 0.0, "stop_gain": 0.0, "stop_error": 0.0, "step_limit": 0.0},
+            most={"stop_error": 0.1} | dict.fromkeys(EXTENTS, LARGEST_EXTENT),
         )
         if self.stop_error is not None and self.task is None:
             raise ValueError("stop_error needs a task to predict; name an episode with --task")

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from tpcd.cli import check_numbers, run
 
+USUAL_OUT = Path("runs/diagnosis")
+
 
 @dataclass(frozen=True)
 class Diagnose:
@@ -14,8 +16,8 @@ class Diagnose:
 
     episodes: tuple[Path, ...] = ()
     """Episodes of one set-up: NAME.csv, NAME.parquet or a folder with one episode."""
-    out: Path = Path("runs/diagnosis")
-    """Folder for the results."""
+    out: Path = USUAL_OUT
+    """Folder for the results; what --compare prints is kept where it is given."""
     prior: str = "ycb-rich"
     """Shape prior: a checkpoint folder, or the name of a shipped one."""
     model: Path | None = None
@@ -50,6 +52,7 @@ def diagnose_episodes(config: Diagnose) -> int:
     import math
     import sys
     from dataclasses import replace
+    from shlex import quote
 
     import torch
     from torch.utils.tensorboard import SummaryWriter
@@ -65,11 +68,15 @@ def diagnose_episodes(config: Diagnose) -> int:
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.model import Model, load_effects, load_model
-    from tpcd.results import format_table, write_results
+    from tpcd.results import format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
     if config.compare:
-        print(format_table(compare_runs(config.compare)))
+        table = compare_runs(config.compare)
+        print(format_table(table))
+        if config.out != USUAL_OUT:
+            with run_folder(config.out, "scripts/diagnose.py", config, config.overwrite) as folder:
+                write_results(folder, table)
         return 0
     torch.set_num_threads(1)
     data = read_data(config.episodes, config.fresh)
@@ -112,8 +119,8 @@ def diagnose_episodes(config: Diagnose) -> int:
     print(f"\nreport in {config.out}/report.html, verdict in {config.out}/verdict.json", end="")
     if found.effects:
         print(
-            f"; next: python scripts/estimate.py EPISODE --prior {config.prior}"
-            f" --model {config.out}/model.yaml --out RUN",
+            f"; next: python scripts/estimate.py EPISODE --prior {quote(str(config.prior))}"
+            f" --model {quote(str(config.out / 'model.yaml'))} --out RUN",
             end="",
         )
     print()

@@ -45,6 +45,7 @@ def estimate_episode(config: Estimate) -> None:
     """Estimate the contact model from an episode and write the belief to a run folder."""
     import sys
     from contextlib import nullcontext
+    from shlex import quote
 
     import torch
     from torch.utils.tensorboard import SummaryWriter
@@ -98,8 +99,8 @@ def estimate_episode(config: Estimate) -> None:
             writer.add_text("table", f"```\n{text}\n```")
         write_results(folder, table, seeds=[config.seed])
     print(
-        f"\nresults in {config.out}; next: python scripts/predict.py {config.out} EPISODE"
-        " --out FILE.csv"
+        f"\nresults in {config.out}; next: python scripts/predict.py {quote(str(config.out))}"
+        " EPISODE --out FILE.csv"
     )
 
 

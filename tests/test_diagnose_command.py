@@ -70,6 +70,12 @@ def test_too_little_data_has_a_verdict_and_an_exit_code_of_its_own(
     assert (out / "config.yaml").is_file() and (out / "versions.json").is_file()
     assert call("diagnose", "--compare", str(out), str(out)) == 0
     assert capsys.readouterr().out.count("not enough information") == 2
+    kept = world / "side by side"
+    assert call("diagnose", "--compare", str(out), str(out), "--out", str(kept)) == 0
+    table = json.loads((kept / "results.json").read_text())["table"]
+    assert [row["verdict"] for row in table] == 2 * ["not enough information"]
+    assert call("diagnose", "--compare", str(out), "--out", str(kept)) == 2
+    assert "is not empty" in capsys.readouterr().err
 
 
 def test_bad_input_is_one_line(world: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 from tpcd.belief import EstimatorSettings
 from tpcd.belief.belief import Belief
@@ -143,8 +144,8 @@ def _finish(
     write_results(folder, table, seeds=[options.seed], moves=moves, stopped_because=reason)
     print(f"\n{moves} moves: {reason}", file=sys.stderr)
     print(
-        f"results in {options.out}; next: python scripts/predict.py {options.out} EPISODE"
-        " --out FILE.csv"
+        f"results in {options.out}; next: python scripts/predict.py {quote(str(options.out))}"
+        " EPISODE --out FILE.csv"
     )
 
 

@@ -15,14 +15,13 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from tpcd.belief import kalman, kernel_filter, kernel_given
+from tpcd.belief import kalman, kernel_filter, kernel_given, kernel_state
 from tpcd.belief.kalman import PASSES
-from tpcd.belief.kernel_filter import (
-    assimilate,
+from tpcd.belief.kernel_filter import assimilate, follow
+from tpcd.belief.kernel_state import (
     begin,
     copy_state,
     expect_gap,
-    follow,
     is_explained,
     new_filter,
     pass_over,
@@ -215,7 +214,7 @@ def _keep(found, answer, i, k):
 
 
 explain_range = _compile_explain_range(
-    source_stamp(sys.modules[__name__], kalman, kernel_filter, kernel_given)
+    source_stamp(sys.modules[__name__], kalman, kernel_filter, kernel_given, kernel_state)
 )
 """Evaluate particles `first` up to `last`: (points, law, given, measured, by_theta, found,
 first, last).

@@ -24,7 +24,8 @@ class Predict:
     rollout: bool = False
     """Start at row 0 and feed on own predictions, instead of on every measured pose."""
     of: Literal["measured", "true"] = "measured"
-    """Intervals of what the sensors read (episode's noise included) or of what is true."""
+    """Intervals of what the sensors read (episode's noise included) or of what is true, compared
+    with the truth where simulate.py left it beside the episodes."""
     particles: int = 400
     """Particles used for prediction."""
     seed: int = 0
@@ -59,6 +60,7 @@ def predict_episodes(config: Predict) -> None:
     from tpcd.errors import RunError
     from tpcd.predict import ContactPredictor
     from tpcd.results import check_target, format_table
+    from tpcd.truth.recording import has_truth, read_truth
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
@@ -90,20 +92,23 @@ def predict_episodes(config: Predict) -> None:
             print(f"{effect.name} is drawn from {source} in {config.model}")
     predictor = ContactPredictor(belief, config.particles)
     predicted: list[PredictedRows] = []
-    for episode in episodes:
+    known = config.of == "true" and all(map(has_truth, read))
+    compared = [read_truth(path)[0] for path in read] if known else episodes
+    for episode, rows in zip(episodes, compared, strict=True):
         if config.rollout:
-            predicted.append(rollout_rows(predictor, episode, generator, config.of))
+            predicted.append(rollout_rows(predictor, episode, generator, config.of, rows))
         else:
-            predicted.append(predict_rows(predictor, episode, config.of))
+            predicted.append(predict_rows(predictor, episode, config.of, rows))
     write_prediction(predicted, config.out)
     everything = PredictedRows(
         *(torch.cat([getattr(p, name) for p in predicted]) for name in vars(predicted[0]))
     )
-    rows = torch.cat([measured_rows(episode)[1:] for episode in episodes])
+    found = torch.cat([measured_rows(rows)[1:] for rows in compared])
     kind = "rollout" if config.rollout else "one-step"
-    print(f"{kind} predictions of {len(rows)} rows, against the rows as measured")
-    print(format_table(score_rows(everything, rows)))
-    if config.of == "true":
+    against = "rows without noise (.truth.csv)" if known else "rows as measured"
+    print(f"{kind} predictions of {len(found)} rows, against the {against}")
+    print(format_table(score_rows(everything, found)))
+    if config.of == "true" and not known:
         print("intervals leave sensor noise out, so noisy rows fall outside of them more often")
     print(f"predictions in {config.out}")
 

@@ -78,6 +78,29 @@ def test_predictions_have_a_row_for_each_step(
     assert "coverage_90" in printed and "mae" in printed
 
 
+def test_predictions_of_what_is_true_are_compared_with_the_truth_where_it_is_known(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for suffix in ("csv", "yaml"):
+        shutil.copy(world / f"test.{suffix}", tmp_path / f"bare.{suffix}")
+
+    def told(episode: Path, of: str) -> tuple[str, float]:
+        out = ("--out", str(tmp_path / "p.csv"), "--overwrite")
+        assert call("predict", str(world / "run"), str(episode), "--of", of, *out) == 0
+        printed = capsys.readouterr().out
+        (force,) = [line.split() for line in printed.splitlines() if line.startswith("F_x")]
+        return printed, float(force[2])
+
+    truly, error = told(world / "test.csv", "true")
+    assert "against the rows without noise" in truly and "noisy rows" not in truly
+    bare, noisy = told(tmp_path / "bare.csv", "true")
+    assert "against the rows as measured" in bare and "noisy rows" in bare
+    measured, same = told(world / "test.csv", "measured")
+    assert "against the rows as measured" in measured and "noisy rows" not in measured
+    assert same == noisy > 0.1
+    assert error < 0.5 * noisy
+
+
 def test_predictions_are_a_table_of_the_kind_that_is_named(world: Path, tmp_path: Path) -> None:
     episodes = (str(world / "test.csv"), str(world / "explore.csv"))
     tables = {}

@@ -176,6 +176,16 @@ def recording_contents(
     return contents
 
 
+def has_truth(path: str | Path) -> bool:
+    """Whether the truth of an episode lies beside it, by the path of the episode."""
+    return _truth_path(Path(path), "yaml").is_file()
+
+
+def _truth_path(path: Path, suffix: str) -> Path:
+    name = path.stem if path.suffix in (".csv", ".parquet", ".yaml") else path.name
+    return path.with_name(f"{name}.truth.{suffix}")
+
+
 def read_truth(path: str | Path) -> tuple[Episode, Scene]:
     """The noise-free rows and the scene of an episode made here, by the path of the episode.
 
@@ -183,8 +193,7 @@ def read_truth(path: str | Path) -> tuple[Episode, Scene]:
     NAME.truth.csv is missing or not what `write_recording` wrote.
     """
     path = Path(path)
-    name = path.stem if path.suffix in (".csv", ".parquet", ".yaml") else path.name
-    scene_path = path.with_name(f"{name}.truth.yaml")
+    scene_path = _truth_path(path, "yaml")
     if not scene_path.is_file():
         raise EpisodeError(scene_path, "no such file", "only simulated episodes have a truth")
     try:
@@ -212,7 +221,7 @@ def read_truth(path: str | Path) -> tuple[Episode, Scene]:
         time_step_s=None,
         priors={},
     )
-    return read_rows(path.with_name(f"{name}.truth.csv"), header), scene
+    return read_rows(_truth_path(path, "csv"), header), scene
 
 
 def _tensor(values: list) -> Tensor:

@@ -3,9 +3,7 @@
 Each run draws theta from the prior, an episode given theta, and asks where theta lies in the
 posterior: its place u = P(entry < true entry | data) is uniform when the posterior is right.
 `eval/drawn.py` says how exactly the episodes come from the likelihood's own model. So what is
-asked is whether likelihood and sampler are right, with the likelihood as it is. The default
-estimator takes it to a power below 1, for outlines whose misfit is unlike the model's; with that
-(`--power 0.7`) intervals hold more than they say here, and the misfit is taken to be too large.
+asked is whether likelihood and sampler are right.
 With `--estimator paper` the data are the same, while that filter assumes another noise: its
 ranks show what this costs.
 
@@ -51,7 +49,7 @@ class Calibration:
     misfit: float | None = None
     """Median of the outline error's standard deviation [m]; by default the prior's own figure."""
     power: float = 1.0
-    """Power to which the default estimator takes the likelihood; at 1 it should be calibrated."""
+    """Power to which the default estimator takes the likelihood; below 1 intervals are wider."""
     particles: int = 0
     """Particles; 0 takes 700 (default) or 5000 (paper), with --quick 300 or 1000."""
     seed: int = 0

@@ -2,7 +2,7 @@
 
 What is exact: each transition starts at the true pose of the row before and settles against
 terrains that are further away by the misfit, of which each run has one field and one size; what
-the field's slope does to the lever is linear. Pose and wrench are measured with noise.
+slopes do to the lever is linear. Pose and wrench are measured with noise.
 Commands depend on earlier measurements only (tpcd/truth/motions.py), which no posterior
 minds, and the start pose is drawn without regard to theta and misfit, as long as the object is
 free there, which the likelihood knows, and near the floor, which the first data say. What is
@@ -83,12 +83,12 @@ def draw_episode(
         wrench_noise = sensor_std[3:] * normal(3) / stiffness
         # The likelihood reads the field at the estimated angle, which the field itself moves.
         error = noise + weight * (wrench_noise - noise)
-        uncovered = misfit_sd * normal(terrains)
+        own, steep = misfit_sd * normal(terrains), misfit_sd * field.roughness * normal(terrains)
         angle = settled[2]
         for _ in range(ANGLE_ROUNDS):
             value, slope = field.basis(angle)
             gap = field.gap(coefficients, angle)
-            gap = gap + (1 - (value**2).sum()).clamp_min(0.0).sqrt() * uncovered
+            gap = gap + field.uncovered(value).sqrt() * own
             there = simulate_step(
                 scene.further(gap),
                 settled,
@@ -97,7 +97,7 @@ def draw_episode(
                 settings.step,
                 previous=commands[-1],
             )
-            lever = coefficients.reshape(terrains, -1) @ slope
+            lever = coefficients.reshape(terrains, -1) @ slope + steep
             pose = there.pose + (there.pose_from_lever * lever[:, None]).sum(0)
             angle = 0.5 * (angle + (pose + error)[2])
         settled = pose

@@ -32,7 +32,7 @@ from tpcd.simulator.settle import settle_from
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
-FIELD = MisfitField(sd=1e-3)
+FIELD = MisfitField(sd=1e-3, grain=0.2, roughness=15.0)
 
 
 @pytest.fixture(scope="module")

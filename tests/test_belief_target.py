@@ -26,6 +26,7 @@ from tpcd.truth.scene import draw_scene, make_truth
 
 STEPS = 8
 """With fewer, no change of contact is located on a path (see `walk`)."""
+FIELD = MisfitField(1e-3, 1.0, grain=0.2, roughness=15.0)
 needs_numba = pytest.mark.skipif(not native.available(), reason="compares the compiled loops")
 
 
@@ -140,7 +141,7 @@ def test_compiled_derivatives_give_the_information_that_differences_give(
 ) -> None:
     """The change of the gain itself is left out: half of them agree to 10 %."""
     truth, episode = truth_and_episode
-    target = ContactTarget(prior, MisfitField(1e-3, 1.0), StepSettings()).given(history_of(episode))
+    target = ContactTarget(prior, FIELD, StepSettings()).given(history_of(episode))
     noise = torch.randn(20, 8, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     score = torch.cat((truth, torch.zeros(1).double())) + 0.02 * noise
     monkeypatch.setattr("tpcd.belief.target._DIFFERENCE", 1e-3)
@@ -158,9 +159,9 @@ def test_gradient_is_that_of_the_log_posterior(
 ) -> None:
     """Up the gradient, scaled by the information, the log posterior rises nearly everywhere."""
     truth, episode = truth_and_episode
-    target: ContactTarget = ContactTarget(
-        prior, MisfitField(1e-3, 1.0), StepSettings(), power=power
-    ).given(history_of(episode))
+    target: ContactTarget = ContactTarget(prior, FIELD, StepSettings(), power=power).given(
+        history_of(episode)
+    )
     noise = torch.randn(30, 8, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     score = torch.cat((truth, torch.zeros(1).double())) + 0.02 * noise
     gradient, information = target.curvature(score)
@@ -179,7 +180,7 @@ def test_a_power_scales_the_likelihood_and_its_threshold(
     prior: ParameterPrior, truth_and_episode: tuple[Tensor, Episode]
 ) -> None:
     truth, episode = truth_and_episode
-    whole = ContactTarget(prior, MisfitField(1e-3, 1.0), StepSettings()).given(history_of(episode))
+    whole = ContactTarget(prior, FIELD, StepSettings()).given(history_of(episode))
     half = replace(whole, power=0.5)
     noise = torch.randn(40, 8, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     score = torch.cat((truth, torch.zeros(1).double())) + 0.1 * noise

@@ -77,7 +77,11 @@ def predictor(request: pytest.FixtureRequest, shape: PolygonShape) -> ContactPre
 
 
 def predictor_of(
-    shape: PolygonShape, effects: tuple[str, ...], misfit_sd: float, coefficients: Tensor
+    shape: PolygonShape,
+    effects: tuple[str, ...],
+    misfit_sd: float,
+    coefficients: Tensor,
+    field: MisfitField = FIELD,
 ) -> ContactPredictor:
     prior = make_prior(shape, effects=[find_effect(name) for name in effects])
     null = torch.zeros(1, len(prior.names) - THETA.shape[1], dtype=torch.float64)
@@ -86,7 +90,7 @@ def predictor_of(
         prior=prior,
         vectors=torch.cat((THETA, null), dim=-1),
         weights=torch.ones(1, dtype=torch.float64),
-        misfit=FIELD,
+        misfit=field,
         misfit_sd=torch.tensor([misfit_sd], dtype=torch.float64),
         misfit_mean=coefficients,
         misfit_covariance=torch.zeros(1, size, size, dtype=torch.float64),
@@ -148,6 +152,27 @@ def test_rollouts_are_as_unsure_as_predictions_where_no_bump_reaches(
             start, down, torch.Generator().manual_seed(0), samples=2000, previous=start
         )
         assert float(drawn[:, 0, 1].std()) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("effects", [(), ("floor_compliance",)], ids=["", "soft"])
+@pytest.mark.parametrize("own", [{"grain": 2.0}, {"roughness": 20.0}], ids=["grain", "rough"])
+def test_rollouts_are_as_unsure_as_predictions_of_what_each_reading_has_of_its_own(
+    shape: PolygonShape, effects: tuple[str, ...], own: dict[str, float], moves: Any
+) -> None:
+    field = replace(FIELD, **own)
+    unsure = predictor_of(shape, effects, 2e-3, torch.zeros_like(COEFFICIENTS), field)
+    smooth = predictor_of(shape, effects, 2e-3, torch.zeros_like(COEFFICIENTS))
+    told = 0
+    for start, command in zip(*moves, strict=True):
+        arguments = (start[None], command[None], start[None])
+        expected = unsure.predict(*arguments).std[0, :3]
+        wider = expected > 1.5 * smooth.predict(*arguments).std[0, :3]
+        generator = torch.Generator().manual_seed(0)
+        drawn = unsure.rollout(start, command[None], generator, samples=4000, previous=start)
+        found = drawn[:, 0, :3].std(0)
+        torch.testing.assert_close(found[wider], expected[wider], rtol=0.1, atol=0.0)
+        told += int(wider.sum())
+    assert told > 2
 
 
 def test_a_trajectory_without_answer_is_replaced_by_another(

@@ -177,8 +177,8 @@ class ContactPredictor:
         """Draw whole trajectories: every particle follows its own poses, n steps long.
 
         Each trajectory keeps one theta, its effects and one draw of its misfit field throughout.
-        What the field does not cover is drawn at each step. A trajectory that a step has no answer
-        for is replaced by another one; where all are, everything is NaN.
+        What the field leaves to each reading is drawn at each step. A trajectory that a step has no
+        answer for is replaced by another one; where all are, everything is NaN.
         """
         chosen = torch.multinomial(self.weights, samples, replacement=True, generator=generator)
         scene = self._scene.gather(chosen)
@@ -189,7 +189,10 @@ class ContactPredictor:
         pose, commands = pose.double(), commands.double()
         before = None if previous is None else previous.double()
         gaps = self._gap(field[:, None], commands[:, 2])
-        rough = None if gaps is None else gaps + self._uncovered(chosen, commands[:, 2], generator)
+        rough, levers = gaps, None
+        if gaps is not None:
+            own, levers = self._of_each_reading(chosen, commands[:, 2], generator)
+            rough = gaps + own
         walk = None
         if self._added.effects:
             rest = pose if before is None else before
@@ -223,6 +226,9 @@ class ContactPredictor:
                 self.belief.misfit, self._field_sd[chosen], here[..., 2], transition
             )
             shift = _shift(rows, field, transition, gap)
+            if levers is not None:
+                lever = levers[:, row - 1, :, None]
+                shift = shift + (transition.pose_from_lever * lever).sum(-2)
             here = here + shift
             if walk is None:
                 offset = here - command
@@ -239,17 +245,17 @@ class ContactPredictor:
         others = torch.multinomial(usable.double(), samples, replacement=True, generator=generator)
         return found_steps[torch.where(usable, torch.arange(samples), others)]
 
-    def _uncovered(
+    def _of_each_reading(
         self, chosen: Int[Tensor, " s"], angles: Float[Tensor, " n"], generator: torch.Generator
-    ) -> Float[Tensor, "s n t"]:
-        """Draws of the part of the gaps that the field's bumps do not cover."""
-        terrains = self._flat.friction.shape[-1]
-        value, _ = self.belief.misfit.basis(angles)
-        left = (1 - (value**2).sum(-1)).clamp_min(0.0).sqrt()
+    ) -> tuple[Float[Tensor, "s n t"], Float[Tensor, "s n t"]]:
+        """Draws of what gaps and levers have besides the field's bumps."""
+        terrains, field = self._flat.friction.shape[-1], self.belief.misfit
+        left = field.uncovered(field.basis(angles)[0]).sqrt()
         noise = torch.randn(
-            len(chosen), len(angles), terrains, generator=generator, dtype=torch.float64
+            2, len(chosen), len(angles), terrains, generator=generator, dtype=torch.float64
         )
-        return self._field_sd[chosen, None, None] * left[:, None] * noise
+        gap, lever = self._field_sd[chosen, None, None] * noise
+        return left[:, None] * gap, field.roughness * lever
 
 
 def _shift(

@@ -184,6 +184,8 @@ def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
         sd=max(sd, settings.least_misfit_sd),
         spread=settings.misfit_spread,
         width=settings.misfit_width,
+        grain=settings.misfit_grain,
+        roughness=settings.misfit_roughness,
     )
 
 

@@ -71,6 +71,8 @@ def compiled_filter(
         setting.used.numpy(),
         OUTLIER_SQUARE,
         FAR,
+        field.grain,
+        field.roughness,
     )
     total = torch.empty(count, dtype=torch.float64)
     mean = torch.zeros(count, size, dtype=torch.float64)

@@ -79,15 +79,18 @@ def _fill_design(design, measured, answer, k, size):
 @inner(forceinline=True)
 @no_type_check
 def _add_uncovered(factor, measured, answer, k, sd):
-    """The part of the outline's error that the bumps do not cover is noise."""
+    """What the outline's error is besides the bumps is noise, of the gap and of its slope."""
     uncovered = 1.0
     for j in range(measured.bumps.shape[1]):
         uncovered -= measured.bumps[k, j] ** 2
-    uncovered = max(uncovered, 0.0) * sd * sd
-    for t in range(answer.from_gap.shape[1]):
+    uncovered = (max(uncovered, 0.0) + measured.grain**2) * sd * sd
+    steep = measured.roughness**2 * sd * sd
+    gap, lever = answer.from_gap, answer.from_lever
+    for t in range(gap.shape[1]):
         for a in range(3):
             for b in range(a + 1):
-                factor[a, b] += uncovered * answer.from_gap[k, t, a] * answer.from_gap[k, t, b]
+                factor[a, b] += uncovered * gap[k, t, a] * gap[k, t, b]
+                factor[a, b] += steep * lever[k, t, a] * lever[k, t, b]
 
 
 @inner(forceinline=True)

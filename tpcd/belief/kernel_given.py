@@ -14,7 +14,8 @@ class Measured(NamedTuple):
     `give` (c, r, 3) is that of `Conditions`. Values and `slopes` (n, j) of the bumps; `rest` (c, n)
     what the terms after each one can still add; `least` (m) what must be reached; `sd` (m) of the
     misfit; `used` (n) says which transitions count: the others part the history. `limit` of an
-    innovation's square; by more than `far` [m] a gap has its transition stepped again.
+    innovation's square; by more than `far` [m] a gap has its transition stepped again. `grain` and
+    `roughness` are those of the `MisfitField`.
     """
 
     poses: np.ndarray
@@ -28,6 +29,8 @@ class Measured(NamedTuple):
     used: np.ndarray
     limit: float
     far: float
+    grain: float
+    roughness: float
 
 
 class Given(NamedTuple):

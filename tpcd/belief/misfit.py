@@ -11,6 +11,11 @@ known moves the terrains themselves: contact begins where the field says.
 
 eps_t(angle) = sum_j b_j(angle) c_tj, with c ~ N(0, sd^2) and Gaussian bumps b_j.
 
+No outline error is that smooth. On a nearly flat face an error of a tenth of a millimetre moves
+the contact point by centimetres within a few milliradians, back and forth from one reading to
+the next. So at each reading the gap and its slope have errors of their own besides (`grain` and
+`roughness`), which nothing is learnt of but how large they are together with the field.
+
 How far the true outline is from the best one of the prior differs by a factor of ten from
 object to object, so sd is itself unknown: log-normal around what the prior missed on outlines
 outside of its training, and learnt as one more entry of every particle.
@@ -40,13 +45,18 @@ class MisfitField:
     """Width and spacing of the bumps [rad]: how far the object turns until the error is another."""
     reach: float = 0.45
     """The bumps cover angles within +-reach [rad]; beyond, the error is independent noise."""
+    grain: float = 0.0
+    """Standard deviation of what each reading's gap has besides, as a share of the field's."""
+    roughness: float = 0.0
+    """The same of the slope [1/rad]."""
 
     def __post_init__(self) -> None:
         """Refuse a field without meaning."""
-        if min(self.sd, self.spread, self.reach) < 0 or self.width <= 0:
+        positive = (self.sd, self.spread, self.reach, self.grain, self.roughness)
+        if min(positive) < 0 or self.width <= 0:
             raise ValueError(
-                f"misfit sd {self.sd}, spread {self.spread} and reach {self.reach} must be >= 0 "
-                f"and width {self.width} > 0"
+                f"misfit sd {self.sd}, spread {self.spread}, reach {self.reach}, grain {self.grain}"
+                f" and roughness {self.roughness} must be >= 0 and width {self.width} > 0"
             )
 
     @property
@@ -80,8 +90,11 @@ class MisfitField:
         blocks = covariance.unflatten(-1, (t, -1)).unflatten(1, (t, -1))
         own = blocks.diagonal(dim1=1, dim2=3)
         known = torch.einsum("na,mabt,nb->mnt", value, own, value)
-        uncovered = (1 - (value**2).sum(-1)).clamp_min(0.0)
-        return known + (sd**2)[:, None, None] * uncovered[:, None]
+        return known + (sd**2)[:, None, None] * self.uncovered(value)[:, None]
+
+    def uncovered(self, value: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch"]:
+        """Variance of a gap, in units of sd^2, that bumps of these values leave to each reading."""
+        return (1 - (value**2).sum(-1)).clamp_min(0.0) + self.grain**2
 
     def basis(
         self, angle: Float[Tensor, "*batch"]
@@ -102,11 +115,11 @@ def misfit_rows(
     transition: Transition,
 ) -> tuple[Float[Tensor, "*batch 3 c"], Float[Tensor, "*batch 3 3"]]:
     """How the settled pose answers the field: rows H with pose = model + H c, and the
-    covariance of the part of the error that the bumps do not cover. c = t x j coefficients."""
+    covariance of what each reading's outline has besides. c = t x j coefficients."""
     value, slope = field.basis(angle)
     gap, lever = transition.pose_from_gap, transition.pose_from_lever
     rows = gap[..., None] * value[..., None, None, :] + lever[..., None] * slope[..., None, None, :]
     rows = rows.transpose(-3, -2).flatten(-2)
-    uncovered = sd**2 * (1 - (value**2).sum(-1)).clamp_min(0.0)
-    covariance = (gap.mT @ gap) * uncovered[..., None, None]
-    return rows, covariance
+    own = (sd**2 * field.uncovered(value))[..., None, None]
+    steep = (sd**2 * field.roughness**2)[..., None, None]
+    return rows, own * (gap.mT @ gap) + steep * (lever.mT @ lever)

@@ -94,6 +94,10 @@ def predict_episodes(config: Predict) -> None:
     predicted: list[PredictedRows] = []
     known = config.of == "true" and all(map(has_truth, read))
     compared = [read_truth(path)[0] for path in read] if known else episodes
+    for path, episode, rows in zip(read, episodes, compared, strict=True):
+        if not torch.equal(rows.commands, episode.commands):
+            fault = "has other commands than the truth beside it"
+            raise RunError(path, fault, "remove that .truth.yaml, or restore the recording")
     for episode, rows in zip(episodes, compared, strict=True):
         if config.rollout:
             predicted.append(rollout_rows(predictor, episode, generator, config.of, rows))

@@ -180,8 +180,8 @@ class Limited:
     [
         ({"count": 0}, "count is 0, expected at least 1"),
         ({"misfit": 0.0}, "misfit is 0, expected more than 0"),
-        ({"misfit": 0.5}, "misfit is 0.5, expected at most 0.05; lengths are in m"),
-        ({"corner": (0.1, -300.0)}, "corner is -300, expected at most 5; lengths are in m"),
+        ({"misfit": 0.5}, "misfit is 0.5, expected at most 0.05 in size; lengths are in m"),
+        ({"corner": (0.1, -300.0)}, "corner is -300, expected at most 5 in size; lengths are in m"),
         ({"misfit": float("nan")}, "misfit is nan, expected a finite number"),
         ({"stiffness": (1.0, -2.0)}, "stiffness is -2, expected more than 0"),
         ({"seed": -1}, "seed is -1, expected 0 to"),

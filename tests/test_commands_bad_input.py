@@ -49,7 +49,7 @@ ESTIMATE = {
     "few particles": (("--particles", "3"), "particles is 3, expected at least 16"),
     "negative particles": (("--particles", "-5"), "particles is -5, expected at least 16"),
     "no misfit": (("--misfit", "0"), "misfit is 0, expected more than 0"),
-    "misfit in mm": (("--misfit", "0.5"), "misfit is 0.5, expected at most 0.05; lengths"),
+    "misfit in mm": (("--misfit", "0.5"), "misfit is 0.5, expected at most 0.05 in size; lengths"),
     "huge seed": (("--seed", "9" * 30), "expected 0 to 9223372036854775807"),
     "misspelt option": (("--particels", "50"), "did you mean --particles?"),
     "file in the way": (("--out", "explore.csv"), "explore.csv: is a file"),

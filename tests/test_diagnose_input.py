@@ -15,7 +15,8 @@ from made_logs import an_episode
 from test_effects_model import block
 from test_noise import STD, episode_of, silent
 
-from tpcd.data.files import write_episode
+from tpcd.data.checks import INVERTED, wrench_slopes
+from tpcd.data.files import read_episode, write_episode
 from tpcd.data.header import Header, read_header
 from tpcd.data.measured import Measured, measured_contents
 from tpcd.discrepancy.checks import check_one_set_up, one_noise, read_data
@@ -57,6 +58,24 @@ def test_a_force_of_the_wrong_sign_is_no_gap_to_name(
     assert f"{wrong}: {name} looks inverted" in error
     assert f"change the sign of the column {name}" in error
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("case", ["offset", "turned"])
+def test_an_offset_or_a_turned_sensor_is_no_wrong_sign(case: str, tmp_path: Path) -> None:
+    """Both make a force that is less than -0.3 times K (pose - command), and effects name them."""
+    good = episode_of(0)
+    expected = good.stiffness * (good.poses - good.commands)
+    wrenches, (e_x, e_z) = good.wrenches.clone(), expected.mT[:2]
+    if case == "offset":
+        axis = 1
+        wrenches[1:, 1] -= 3 * e_z.square().sum() / e_z.sum()
+    else:
+        axis = 0
+        wrenches[:, 0] -= 3 * e_z * e_x.square().sum() / (e_x * e_z).sum()
+    told = write_episode(replace(good, wrenches=wrenches), tmp_path / "told.csv")
+    slope = list(wrench_slopes(read_episode(told)).values())[axis]
+    assert slope is not None and slope < INVERTED
+    assert len(read_data([told]).episodes) == 1
 
 
 @pytest.mark.parametrize("case", CHANGES)

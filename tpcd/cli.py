@@ -157,7 +157,7 @@ def check_numbers(
             if above and name in above and value <= above[name]:
                 raise ValueError(f"{name} is {value:g}, expected more than {above[name]:g}")
             if most and name in most and abs(value) > most[name]:
-                limit = f"expected at most {most[name]:g}; lengths are in m, angles in rad"
+                limit = f"expected at most {most[name]:g} in size; lengths are in m, angles in rad"
                 raise ValueError(f"{name} is {value:g}, {limit}")
             if name in ("seed", "seeds") and not 0 <= value <= LARGEST_SEED:
                 raise ValueError(f"{name} is {value}, expected 0 to {LARGEST_SEED}")

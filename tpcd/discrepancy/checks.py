@@ -65,9 +65,13 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
 
 
 def _check_signs(path: Path, episode: Episode) -> None:
-    # A torque may turn with the point that it is about, which a diagnosis can name.
-    for name, slope in list(wrench_slopes(episode).items())[:2]:
-        if slope is not None and slope < INVERTED:
+    # Offsets and a turned sensor, which a diagnosis can name, are left aside; so is the torque,
+    # which may turn with the point that it is about.
+    forces = (episode.stiffness * (episode.poses - episode.commands))[:, :2]
+    design = torch.cat((forces, torch.ones_like(forces[:, :1])), dim=-1)
+    own = torch.linalg.lstsq(design, episode.wrenches[:, :2], driver="gelsd").solution
+    for axis, (name, slope) in enumerate(list(wrench_slopes(episode).items())[:2]):
+        if slope is not None and max(slope, float(own[axis, axis])) < INVERTED:
             remedy = f"change the sign of the column {name}, or of its frame"
             raise EpisodeError(path, inverted_sentence(name, slope), remedy)
 

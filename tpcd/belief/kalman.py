@@ -7,9 +7,9 @@ as the filtered field g = E[c] says, and leaves the residual
 
     r_k = poses[k] - f(s, g, u_k) + H_k g = e_k - F_k (e_{k-1} - E[e_{k-1}]) + H_k c + v_k,
 
-with F = d pose / d start, H from `misfit_rows` and v_k ~ N(0, V_k) what each
-reading's outline has besides. So one reading's error is in two residuals, and the state (c, e_{k-1}) is carried from
-one transition to the next. In free motion the arm reaches its command, and what was read
+with F = d pose / d start, H from `misfit_rows` and v_k ~ N(0, V_k) what each reading's outline
+has besides. So one reading's error is in two residuals, and the state (c, e_{k-1}) is carried
+from one transition to the next. In free motion the arm reaches its command, and what was read
 there no longer matters. The innovations give the likelihood of theta term by term, and the
 state the posterior of the field (Kalman 1960; Rao-Blackwellised particle filters).
 

@@ -11,10 +11,10 @@ known moves the terrains themselves: contact begins where the field says.
 
 eps_t(angle) = sum_j b_j(angle) c_tj, with c ~ N(0, sd^2) and Gaussian bumps b_j.
 
-No outline error is that smooth. On a nearly flat face an error of a tenth of a millimetre moves
-the contact point by centimetres within a few milliradians, back and forth from one reading to
-the next. So at each reading the gap and its slope have errors of their own besides (`grain` and
-`roughness`), which nothing is learnt of but how large they are together with the field.
+Outline errors need not be that smooth: on a nearly flat face a tenth of a millimetre can move
+the contact point by centimetres within a few milliradians. So at each reading the gap and its
+slope have errors of their own besides (`grain` and `roughness`), anew also where the object has
+not moved; nothing is learnt of them but how large they are together with the field.
 
 How far the true outline is from the best one of the prior differs by a factor of ten from
 object to object, so sd is itself unknown: log-normal around what the prior missed on outlines

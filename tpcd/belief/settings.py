@@ -86,7 +86,7 @@ class EstimatorSettings:
     """Standard deviation of what the outline error is besides at each reading, as a share."""
     misfit_roughness: float = 15.0
     """The same of its slope, which moves the contact point [1/rad]: 7.5 mm at a misfit of 0.5 mm.
-    Without both, intervals on real outlines with flat faces are too narrow."""
+    Without both, intervals on real outlines were too narrow (eval/README.md)."""
     least_misfit_sd: float = 1e-4
     """The median is never taken to be less than this [m]."""
     effects: tuple[Effect, ...] = ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from exact_likelihood import exact_log_likelihood
 
@@ -14,6 +16,7 @@ from tpcd.belief.settings import EstimatorSettings
 from tpcd.contact import scene_from_parameters
 from tpcd.parameters import Parameters
 from tpcd.shape.checkpoint import load_prior
+from tpcd.shape.protocol import Misfit
 
 EPISODES = 12
 
@@ -24,12 +27,11 @@ def test_with_a_misfit_of_millimetres_the_likelihood_is_nearly_exact() -> None:
     In two of these twelve the first contact is at a place where none was expected, or the other
     way round, which no linearisation tells.
     """
-    shape = load_prior("ycb21-z2")
-    prior = make_prior(shape)
     # What each reading has besides is linear by its definition, and no draws would meet it.
-    settings = EstimatorSettings(
-        misfit_sd=3e-3, misfit_spread=0.0, misfit_grain=0.0, misfit_roughness=0.0
-    )
+    smooth = Misfit(3e-3, width=0.15, grain=0.0, roughness=0.0)
+    shape = replace(load_prior("ycb21-z2"), misfit=smooth)
+    prior = make_prior(shape)
+    settings = EstimatorSettings(misfit_spread=0.0)
     field = misfit_field(shape, settings)
     off = []
     for seed in range(EPISODES):

@@ -14,8 +14,10 @@ from tpcd.errors import CheckpointError
 from tpcd.shape.checkpoint import CARD, WEIGHTS, load_prior, save_prior
 from tpcd.shape.deepsdf import Architecture, DeepSDFNetwork
 from tpcd.shape.density import MaskDensity
+from tpcd.shape.protocol import Misfit
 
 SMALL = Architecture(2, sdf_width=8, sdf_depth=2, head_width=8, head_depth=1, points=16)
+MISFIT = Misfit(0.002, 0.2, 0.1, 5.0)
 
 
 @pytest.fixture
@@ -24,13 +26,13 @@ def folder(tmp_path: Path) -> Path:
         torch.manual_seed(0)
         network = DeepSDFNetwork(SMALL, 3)
     density = MaskDensity(torch.eye(4, dtype=torch.bool))
-    return save_prior(tmp_path / "small", network, density, ("a", "b", "c"), 0.002, {"note": "x"})
+    return save_prior(tmp_path / "small", network, density, ("a", "b", "c"), MISFIT, {"note": "x"})
 
 
 def test_a_saved_prior_comes_back_the_same(folder: Path, tmp_path: Path) -> None:
     first = load_prior(folder)
     second = load_prior(
-        save_prior(tmp_path / "again", first.network, first.density, first.names, 0.002, {})
+        save_prior(tmp_path / "again", first.network, first.density, first.names, MISFIT, {})
     )
     latent = torch.linspace(-0.9, 0.9, 10, dtype=torch.float64).reshape(5, 2)
     torch.testing.assert_close(second.boundary_points(latent), first.boundary_points(latent))
@@ -39,7 +41,7 @@ def test_a_saved_prior_comes_back_the_same(folder: Path, tmp_path: Path) -> None
         second.signed_distance(points, latent), first.signed_distance(points, latent)
     )
     assert torch.equal(second.valid(latent), first.valid(latent))
-    assert (second.misfit_sd, second.names) == (0.002, ("a", "b", "c"))
+    assert (second.misfit, second.names) == (MISFIT, ("a", "b", "c"))
     assert first.card["note"] == "x"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["again", "small"]
 
@@ -47,6 +49,21 @@ def test_a_saved_prior_comes_back_the_same(folder: Path, tmp_path: Path) -> None
 def _edit_card(folder: Path, **changes: object) -> None:
     card = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(card | changes))
+
+
+def test_a_card_without_the_texture_of_the_misfit_takes_the_defaults(folder: Path) -> None:
+    card = json.loads((folder / CARD).read_text())
+    for key in ("misfit_width_rad", "misfit_grain", "misfit_roughness_per_rad"):
+        del card[key]
+    (folder / CARD).write_text(json.dumps(card))
+    assert load_prior(folder).misfit == Misfit(sd=MISFIT.sd)
+
+
+@pytest.mark.parametrize("key", ["misfit_sd_m", "misfit_width_rad", "misfit_roughness_per_rad"])
+def test_a_misfit_without_meaning_is_refused(folder: Path, key: str) -> None:
+    _edit_card(folder, **{key: -1.0})
+    with pytest.raises(CheckpointError, match="must be >= 0"):
+        load_prior(folder)
 
 
 def _edit_tensors(folder: Path, change) -> None:

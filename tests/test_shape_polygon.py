@@ -92,7 +92,7 @@ def test_every_answer_has_the_batch_and_dtype_of_the_latent(batch, dtype):
 def test_the_latent_has_size_zero_and_the_outline_no_misfit():
     shape = PolygonShape(BUILTIN["mug"])
     assert shape.latent_dim == 0
-    assert shape.misfit_sd == 0.0
+    assert shape.misfit.sd == 0.0
     assert shape.sample_latent(7, torch.Generator()).shape == (7, 0)
 
 

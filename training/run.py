@@ -21,6 +21,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tpcd.errors import RunError
 from tpcd.shape.checkpoint import load_prior, save_prior
 from tpcd.shape.deepsdf import DeepSDFNetwork
+from tpcd.shape.protocol import Misfit
 from training.config import TrainingConfig
 from training.data import Prepared, PriorData, prepare
 from training.evaluate import measure_prior
@@ -91,7 +92,7 @@ def export_prior(
         "configuration": dataclasses.asdict(config),
         "versions": {"python": platform.python_version()} | {p: version(p) for p in PACKAGES},
     }
-    return save_prior(folder, network, density, prepared.names, 0.0, card)
+    return save_prior(folder, network, density, prepared.names, Misfit(), card)
 
 
 def complete_card(
@@ -104,20 +105,19 @@ def complete_card(
     """
     shape = load_prior(folder)
     card = dict(shape.card) | measure_prior(shape, outlines, config.check.draws)
-    misfit_sd = shape.misfit_sd
+    misfit = shape.misfit
     strangers = unseen_outlines(shape.names, config.data) if config.check.unseen else {}
     if config.unseen_from:
         other = load_prior(config.unseen_from)
         card["unseen"] = {"measured_with": config.unseen_from, **other.card["unseen"]}
-        misfit_sd = other.misfit_sd
+        misfit = other.misfit
         card["misfit_log_std"] = other.card["misfit_log_std"]
     elif strangers:
         report = measure_unseen(shape, strangers)
         card["unseen"] = report.figures
-        misfit_sd = report.misfit_sd
+        misfit = report.misfit
         card["misfit_log_std"] = round(report.misfit_log_std, 4)
-    card["misfit_sd_m"] = misfit_sd
-    save_prior(folder, shape.network, shape.density, shape.names, misfit_sd, card)
+    save_prior(folder, shape.network, shape.density, shape.names, misfit, card)
     by_outline = card["training_errors_by_outline_mean_p95_max"]
     errors = {name: figures["level_set"][0] for name, figures in by_outline.items()}
     with SummaryWriter(str(out / "tensorboard")) as writer:

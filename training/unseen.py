@@ -1,4 +1,4 @@
-"""How well a prior fits objects it has not seen: `misfit_sd_m` and `misfit_log_std` of its card."""
+"""How well a prior fits objects it has not seen: the misfit in its card."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Float64
 
 from tpcd.shape.deepsdf import DeepSDFShape
+from tpcd.shape.protocol import Misfit
 from tpcd.shape.ycb import load_ycb, ycb_folder
 from training.config import DataConfig
 from training.evaluate import Spread
 from training.fit import best_fit
+from training.misfit import measure_misfit
 from training.outlines import suitable
 
 
@@ -22,11 +24,11 @@ class UnseenReport:
 
     figures: dict[str, object]
     """Errors in mm, for the card."""
-    misfit_sd: float
-    """Median over the outlines of the root mean square difference of the support functions of
-    outline and best fit [m]: the size of a misfit to expect."""
+    misfit: Misfit
+    """How the outlines differ from their best fits."""
     misfit_log_std: float
-    """Standard deviation of the logarithms of these: how much the size varies by object."""
+    """Standard deviation of the logarithm of the size of the misfit: how much it varies by
+    object."""
 
 
 def object_of(name: str) -> str:
@@ -55,21 +57,20 @@ def measure_unseen(
     alone = {n: best_fit(shape, v, generator, scene=False) for n, v in outlines.items()}
     hull = {n: float(np.sqrt(np.square(f.hull_errors_mm).mean())) for n, f in with_scene.items()}
     sizes = np.array(list(hull.values()))
-    # The median, as a few outlines far outside the family would make up most of a mean square.
-    misfit_mm, log_std = float(np.median(sizes)), float(np.log(sizes).std())
+    misfit, log_std = measure_misfit(with_scene.values()), float(np.log(sizes).std())
     figures: dict[str, object] = {
         "outlines": len(outlines),
         "best_fit_mm": vars(Spread.of(_pooled(with_scene))),
         "best_fit_latent_only_mm": vars(Spread.of(_pooled(alone))),
         "hull_rms_mm": round(float(np.sqrt(np.square(sizes).mean())), 4),
-        "hull_rms_mm_median": round(misfit_mm, 4),
+        "hull_rms_mm_median": round(float(np.median(sizes)), 4),
         "hull_rms_mm_by_outline": {name: round(size, 4) for name, size in hull.items()},
         "mean_mm_by_outline": {
             name: round(float(fit.errors_mm.mean()), 3) for name, fit in with_scene.items()
         },
         "fitted": "latent, scale in [0.8, 1.2], mount within 20 mm and 0.2 rad",
     }
-    return UnseenReport(figures, misfit_mm / 1000.0, log_std)
+    return UnseenReport(figures, misfit, log_std)
 
 
 def _pooled(fits: dict) -> np.ndarray:

@@ -179,13 +179,14 @@ def prior_belief(
 
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
     """The misfit field that belongs to a shape model."""
-    sd = shape.misfit_sd if settings.misfit_sd is None else settings.misfit_sd
+    own = shape.misfit
+    sd = own.sd if settings.misfit_sd is None else settings.misfit_sd
     return MisfitField(
         sd=max(sd, settings.least_misfit_sd),
         spread=settings.misfit_spread,
-        width=settings.misfit_width,
-        grain=settings.misfit_grain,
-        roughness=settings.misfit_roughness,
+        width=own.width,
+        grain=own.grain,
+        roughness=own.roughness,
     )
 
 

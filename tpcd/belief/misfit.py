@@ -44,7 +44,7 @@ class MisfitField:
     width: float = 0.15
     """Width and spacing of the bumps [rad]: how far the object turns until the error is another."""
     reach: float = 0.45
-    """The bumps cover angles within +-reach [rad]; beyond, the error is independent noise."""
+    """The bumps cover angles within about +-reach [rad]; beyond, the error is independent noise."""
     grain: float = 0.0
     """Standard deviation of what each reading's gap has besides, as a share of the field's."""
     roughness: float = 0.0
@@ -64,7 +64,7 @@ class MisfitField:
         """Number of bumps for each terrain; none where the field is switched off."""
         if self.sd == 0:
             return 0
-        return 2 * math.ceil(self.reach / self.width) + 1
+        return 2 * round(self.reach / self.width) + 1
 
     def sd_of(self, score: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Standard deviation of the outline error [m] from a standard normal score."""

@@ -80,13 +80,6 @@ class EstimatorSettings:
     the shape model's own figure."""
     misfit_spread: float = 1.0
     """Standard deviation of the logarithm of that standard deviation; 0 makes it known."""
-    misfit_width: float = 0.15
-    """How far the object turns until the outline error is another one [rad]."""
-    misfit_grain: float = 0.2
-    """Standard deviation of what the outline error is besides at each reading, as a share."""
-    misfit_roughness: float = 15.0
-    """The same of its slope, which moves the contact point [1/rad]: 7.5 mm at a misfit of 0.5 mm.
-    Without both, intervals on real outlines were too narrow (eval/README.md)."""
     least_misfit_sd: float = 1e-4
     """The median is never taken to be less than this [m]."""
     effects: tuple[Effect, ...] = ()

@@ -58,7 +58,7 @@ class Question:
             STATE_VERSION,
             *(history.commands, history.readings, history.sensor_variance, history.stiffness),
             *(history.used, history.seams, history.parity_counts, scene.low, scene.high),
-            *(type(scene.shape).__name__, scene.shape.latent_dim, scene.shape.misfit_sd),
+            *(type(scene.shape).__name__, scene.shape.latent_dim, scene.shape.misfit),
             *(self.misfit, self.step, self.sampler, self.seed),
         )
 

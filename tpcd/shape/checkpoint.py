@@ -26,6 +26,7 @@ from torch import Tensor
 from tpcd.errors import CheckpointError
 from tpcd.shape.deepsdf import Architecture, DeepSDFNetwork, DeepSDFShape
 from tpcd.shape.density import LatentDensity, MaskDensity, MixtureDensity
+from tpcd.shape.protocol import Misfit
 
 FORMAT = "tpcd-prior"
 FORMAT_VERSION = 1
@@ -34,6 +35,13 @@ DENSITIES: dict[str, type[MaskDensity] | type[MixtureDensity]] = {
     "mask": MaskDensity,
     "mixture": MixtureDensity,
 }
+_MISFIT = {
+    "misfit_sd_m": "sd",
+    "misfit_width_rad": "width",
+    "misfit_grain": "grain",
+    "misfit_roughness_per_rad": "roughness",
+}
+"""Keys of the card and the fields of `Misfit` that they hold."""
 _REMEDY = "export it again with `python -m training.train`, or use a shipped prior"
 
 
@@ -55,7 +63,7 @@ def load_prior(path_or_name: str | Path) -> DeepSDFShape:
         architecture = Architecture(**card["architecture"])
         names = tuple(card["outlines"])
         density_kind = DENSITIES[card["density"]]
-        misfit = float(card["misfit_sd_m"])
+        misfit = _misfit(card)
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(folder / CARD, f"lacks or garbles {error}", _REMEDY) from error
     network = DeepSDFNetwork(architecture, len(names))
@@ -69,7 +77,7 @@ def save_prior(
     network: DeepSDFNetwork,
     density: MaskDensity | MixtureDensity,
     names: tuple[str, ...],
-    misfit_sd: float,
+    misfit: Misfit,
     card: Mapping[str, Any],
 ) -> Path:
     """Write a prior to `folder`, replacing an older one at once; returns the folder.
@@ -88,8 +96,8 @@ def save_prior(
         "name": folder.name,
         "architecture": dataclasses.asdict(network.architecture),
         "density": kind,
-        "misfit_sd_m": misfit_sd,
         **card,
+        **{key: getattr(misfit, name) for key, name in _MISFIT.items()},
         "outlines": list(names),
         "weights_sha256": hashlib.sha256(weights).hexdigest(),
     }
@@ -137,6 +145,13 @@ def _read_card(path: Path) -> dict[str, Any]:
             path, f"has format version {version}, this program reads {FORMAT_VERSION}", _REMEDY
         )
     return card
+
+
+def _misfit(card: Mapping[str, Any]) -> Misfit:
+    """All but the size may be missing: nobody measured them, and they take their defaults."""
+    sd = float(card["misfit_sd_m"])
+    others = {name: float(card[key]) for key, name in _MISFIT.items() if key in card}
+    return Misfit(**others | {"sd": sd})
 
 
 def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:

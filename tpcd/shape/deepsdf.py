@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from tpcd.shape.density import LatentDensity
+from tpcd.shape.protocol import Misfit
 
 UNIT = 0.1
 """Length that the networks see as 1 [m]."""
@@ -108,9 +109,9 @@ class DeepSDFShape:
     """Prior density of the latent and the region where it is valid."""
     names: tuple[str, ...] = ()
     """Names of the training outlines, in the order of `codes`."""
-    misfit_sd: float = 0.0
-    """Median root mean square error of the best fit to unseen outlines, as contact feels it
-    [m]; the card's `misfit_log_std` says how much its logarithm varies by object."""
+    misfit: Misfit = Misfit()
+    """How unseen outlines differ from their best fits; the card's `misfit_log_std` says how much
+    the logarithm of the size varies by object."""
     card: Mapping[str, Any] = field(default_factory=dict)
     """The checkpoint's card: configuration, errors, provenance."""
     _copies: dict[tuple[torch.device, torch.dtype], DeepSDFNetwork] = field(

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from tpcd.shape.protocol import Misfit
 from tpcd.shape.outline import Outline, hull, points_at, resample_positions
 
 CHUNK = 1 << 16
@@ -31,8 +32,8 @@ class PolygonShape:
     """Boundary points to aim at. All vertices are taken where they are no more than this;
     otherwise all hull vertices, however many, filled up with resampled points: a half-plane
     touches only hull vertices, so contact with floor and wall stays exact."""
-    misfit_sd: float = 0.0
-    """Standard deviation of the outline error [m]."""
+    misfit: Misfit = Misfit()
+    """How the true outline differs from this one."""
     latent_dim: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:

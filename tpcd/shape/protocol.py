@@ -7,11 +7,41 @@ object frame at scale 1.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How an outline that a family has not seen differs from the best one of it, seen from a flat
+    terrain: its support function is off by a random function of the angle, which `training.misfit`
+    measures.
+
+    The defaults of what follows the first are those of `ycb-rich`, for shapes of which nothing
+    was measured.
+    """
+
+    sd: float = 0.0
+    """Standard deviation of its smooth part [m], in the median over outlines; 0 where the outline
+    is exact."""
+    width: float = 0.137
+    """Between two angles that has the correlation exp(-(a - b)^2 / (4 width^2)) [rad]."""
+    grain: float = 0.1
+    """Standard deviation of what is not smooth, as a share of `sd`."""
+    roughness: float = 9.4
+    """The same of its slope [1/rad], by which contact is elsewhere along the terrain."""
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        if min(self.sd, self.grain, self.roughness) < 0 or not 0 < self.width < float("inf"):
+            raise ValueError(
+                f"sd {self.sd}, grain {self.grain} and roughness {self.roughness} must be >= 0 "
+                f"and width {self.width} > 0"
+            )
 
 
 @runtime_checkable
@@ -24,9 +54,8 @@ class Shape(Protocol):
         ...
 
     @property
-    def misfit_sd(self) -> float:
-        """Standard deviation of the distance between the best outline of the family and an
-        outline it has not seen [m]; 0 where the outline is exact."""
+    def misfit(self) -> Misfit:
+        """How outlines that the family has not seen differ from the best one of it."""
         ...
 
     def signed_distance(

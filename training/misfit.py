@@ -1,0 +1,71 @@
+"""How outlines differ from their best fits, as contact feels it: `tpcd.shape.protocol.Misfit`.
+
+The difference e of two support functions is a function of the angle. Half the mean square of
+e(a + d) - e(a), over its mean square, is the variogram of the outline. Its median over outlines is
+fitted with what the model of the estimator says (`tpcd.belief.misfit`),
+
+    V(d) = 1 - s exp(-d^2 / (4 width^2)),    s = 1 / (1 + grain^2)  the share of the smooth part,
+
+over the angles between two readings that matter: from `NEAREST`, since grain is new at each
+reading, to the `FURTHEST` that the model covers. Relative to that of the smooth part, the mean
+square of its slope is 1 / (2 width^2); what the slope of e has more is roughness. Where a nearly
+flat face touches, e hardly changes while contact jumps from one end to the other, so slopes are
+far larger than a smooth function of the size of e would have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import least_squares
+
+from tpcd.shape.protocol import Misfit
+from training.fit import Fit
+
+NEAREST, FURTHEST = 0.025, 0.45
+"""Angles between two readings over which the variogram is fitted [rad]."""
+
+
+def measure_misfit(fits: Iterable[Fit]) -> Misfit:
+    """Size and texture of the misfit, each in the median over outlines."""
+    fits = list(fits)
+    sizes = np.array([_root_mean_square(fit.hull_errors_mm) for fit in fits])
+    lags, variograms = zip(*(variogram(fit.hull_errors_mm) for fit in fits), strict=True)
+    steep = [_root_mean_square(f.hull_slopes_mm) / s for f, s in zip(fits, sizes, strict=True)]
+    width, grain = fit_variogram(lags[0], np.median(variograms, axis=0))
+    whole = 1 + grain**2
+    rough = float(np.median(steep)) ** 2 * whole - 1 / (2 * width**2)
+    # The median, as a few outlines far outside the family would make up most of a mean square.
+    sd = float(np.median(sizes)) / whole**0.5 / 1000.0
+    return Misfit(sd, width, grain, max(rough, 0.0) ** 0.5)
+
+
+def variogram(
+    error: Float64[np.ndarray, " k"],
+) -> tuple[Float64[np.ndarray, " l"], Float64[np.ndarray, " l"]]:
+    """Lags between `NEAREST` and `FURTHEST` [rad], and the variogram there of an error that is
+    known at k angles all around, relative to its mean square."""
+    step = 2 * np.pi / len(error)
+    shifts = np.arange(round(NEAREST / step), round(FURTHEST / step) + 1)
+    squares = [np.square(np.roll(error, -shift) - error).mean() for shift in shifts]
+    return shifts * step, np.array(squares) / (2 * np.square(error).mean())
+
+
+def fit_variogram(
+    lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]
+) -> tuple[float, float]:
+    """Width [rad] and grain whose variogram has the least squared distance from `values`."""
+
+    def distance(guess: np.ndarray) -> np.ndarray:
+        width, share = guess
+        return 1 - share * np.exp(-(lags**2) / (4 * width**2)) - values
+
+    found = least_squares(distance, (0.15, 0.9), bounds=((0.02, 0.1), (2.0, 1.0)))
+    width, share = (float(value) for value in found.x)
+    return width, (1 / share - 1) ** 0.5
+
+
+def _root_mean_square(values: Float64[np.ndarray, " k"]) -> float:
+    return float(np.sqrt(np.square(values).mean()))

@@ -28,7 +28,7 @@ def test_with_a_misfit_of_millimetres_the_likelihood_is_nearly_exact() -> None:
     way round, which no linearisation tells.
     """
     # What each reading has besides is linear by its definition, and no draws would meet it.
-    smooth = Misfit(3e-3, width=0.15, grain=0.0, roughness=0.0)
+    smooth = Misfit(3e-3, 0.0, width=0.15, grain=0.0, roughness=0.0)
     shape = replace(load_prior("ycb21-z2"), misfit=smooth)
     prior = make_prior(shape)
     settings = EstimatorSettings(misfit_spread=0.0)

@@ -17,7 +17,7 @@ from tpcd.shape.density import MaskDensity
 from tpcd.shape.protocol import Misfit
 
 SMALL = Architecture(2, sdf_width=8, sdf_depth=2, head_width=8, head_depth=1, points=16)
-MISFIT = Misfit(0.002, 0.2, 0.1, 5.0)
+MISFIT = Misfit(0.002, 0.8, 0.2, 0.1, 5.0)
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def _edit_card(folder: Path, **changes: object) -> None:
 
 def test_a_card_without_the_texture_of_the_misfit_takes_the_defaults(folder: Path) -> None:
     card = json.loads((folder / CARD).read_text())
-    for key in ("misfit_width_rad", "misfit_grain", "misfit_roughness_per_rad"):
+    for key in ("misfit_log_std", "misfit_width_rad", "misfit_grain", "misfit_roughness_per_rad"):
         del card[key]
     (folder / CARD).write_text(json.dumps(card))
     assert load_prior(folder).misfit == Misfit(sd=MISFIT.sd)

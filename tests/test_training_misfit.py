@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.fit import DIRECTIONS, Fit, _support
+from training.fit import DIRECTIONS, Fit, support_of
 from training.misfit import fit_variogram, measure_misfit, variogram
 
 ANGLE = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
@@ -28,8 +28,12 @@ def drawn(rng: np.random.Generator, sd: float, width: float, grain: float, rough
 def test_the_texture_of_random_errors_is_found(texture: tuple[float, float, float]) -> None:
     rng = np.random.default_rng(0)
     width, grain, rough = texture
-    found = measure_misfit([drawn(rng, 0.5, *texture) for _ in range(60)])
-    assert found.sd == pytest.approx(0.0005, rel=0.1)
+    unseen = [drawn(rng, 0.5, *texture) for _ in range(60)]
+    known = [0.05 * np.ones(7), 0.05 * np.ones(7)]
+    found = measure_misfit(unseen, known)
+    # Halfway between the logarithms of the unseen and of the known, and off by as much from both.
+    assert found.sd == pytest.approx(0.00158 * 0.1, rel=0.1)
+    assert found.spread == pytest.approx(np.log(10) / 2, abs=0.1)
     assert found.width == pytest.approx(width, rel=0.1)
     assert found.grain == pytest.approx(grain, abs=0.05)
     assert found.roughness == pytest.approx(rough, abs=1.0)
@@ -48,7 +52,7 @@ def test_errors_without_a_memory_differ_by_twice_their_square() -> None:
 
 def test_slopes_are_derivatives_of_the_support_function() -> None:
     polygon = np.array([[0.05, 0.02], [-0.04, 0.03], [-0.05, -0.02], [0.04, -0.03]])
-    value, slope = _support(polygon)
+    value, slope = support_of(polygon)
     smooth = np.abs(np.diff(slope, append=slope[0])) < 1e-3
     smooth &= np.roll(smooth, 1)
     difference = (np.roll(value, -1) - np.roll(value, 1)) / (2 * ANGLE[1])

@@ -88,11 +88,11 @@ def best_fit(
     distance = shapely.distance(
         shapely.LinearRing(fitted), shapely.points(uniform_points(vertices))
     )
-    hull, slopes = _support(fitted) - _support(vertices)
+    hull, slopes = support_of(fitted) - support_of(vertices)
     return Fit(z.double(), MM * distance, MM * hull, MM * slopes)
 
 
-def _support(polygon: Float64[np.ndarray, "p 2"]) -> Float64[np.ndarray, "2 k"]:
+def support_of(polygon: Float64[np.ndarray, "p 2"]) -> Float64[np.ndarray, "2 k"]:
     """Support function in `DIRECTIONS` and its derivative by the angle, which is where the outmost
     point lies along the edge of the half-plane that it touches."""
     angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)

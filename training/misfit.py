@@ -1,5 +1,9 @@
 """How outlines differ from their best fits, as contact feels it: `tpcd.shape.protocol.Misfit`.
 
+Whether the object in the hand is one that the prior knows, nobody tells. So the size of the misfit
+is that of training outlines and of unseen ones, in equal shares: logarithms of the two have their
+common mean and standard deviation. Its texture is that of unseen ones.
+
 The difference e of two support functions is a function of the angle. Half the mean square of
 e(a + d) - e(a), over its mean square, is the variogram of the outline. Its median over outlines is
 fitted with what the model of the estimator says (`tpcd.belief.misfit`),
@@ -15,7 +19,7 @@ far larger than a smooth function of the size of e would have.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -28,18 +32,21 @@ NEAREST, FURTHEST = 0.025, 0.45
 """Angles between two readings over which the variogram is fitted [rad]."""
 
 
-def measure_misfit(fits: Iterable[Fit]) -> Misfit:
-    """Size and texture of the misfit, each in the median over outlines."""
-    fits = list(fits)
+def measure_misfit(fits: Sequence[Fit], trained: Sequence[Float64[np.ndarray, " k"]]) -> Misfit:
+    """Size and texture of the misfit, from best fits to unseen outlines and from the differences
+    of the support functions of training outlines [mm]; the texture is in the median over outlines.
+    """
     sizes = np.array([_root_mean_square(fit.hull_errors_mm) for fit in fits])
     lags, variograms = zip(*(variogram(fit.hull_errors_mm) for fit in fits), strict=True)
     steep = [_root_mean_square(f.hull_slopes_mm) / s for f, s in zip(fits, sizes, strict=True)]
     width, grain = fit_variogram(lags[0], np.median(variograms, axis=0))
     whole = 1 + grain**2
     rough = float(np.median(steep)) ** 2 * whole - 1 / (2 * width**2)
-    # The median, as a few outlines far outside the family would make up most of a mean square.
-    sd = float(np.median(sizes)) / whole**0.5 / 1000.0
-    return Misfit(sd, width, grain, max(rough, 0.0) ** 0.5)
+    logs = [np.log(sizes), np.log([_root_mean_square(error) for error in trained])]
+    mean = np.mean([group.mean() for group in logs])
+    square = np.mean([np.square(group - mean).mean() for group in logs])
+    sd = float(np.exp(mean)) / whole**0.5 / 1000.0
+    return Misfit(sd, float(square) ** 0.5, width, grain, max(rough, 0.0) ** 0.5)
 
 
 def variogram(

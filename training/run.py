@@ -111,12 +111,10 @@ def complete_card(
         other = load_prior(config.unseen_from)
         card["unseen"] = {"measured_with": config.unseen_from, **other.card["unseen"]}
         misfit = other.misfit
-        card["misfit_log_std"] = other.card["misfit_log_std"]
     elif strangers:
-        report = measure_unseen(shape, strangers)
+        report = measure_unseen(shape, strangers, outlines)
         card["unseen"] = report.figures
         misfit = report.misfit
-        card["misfit_log_std"] = round(report.misfit_log_std, 4)
     save_prior(folder, shape.network, shape.density, shape.names, misfit, card)
     by_outline = card["training_errors_by_outline_mean_p95_max"]
     errors = {name: figures["level_set"][0] for name, figures in by_outline.items()}

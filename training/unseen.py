@@ -12,8 +12,8 @@ from tpcd.shape.deepsdf import DeepSDFShape
 from tpcd.shape.protocol import Misfit
 from tpcd.shape.ycb import load_ycb, ycb_folder
 from training.config import DataConfig
-from training.evaluate import Spread
-from training.fit import best_fit
+from training.evaluate import MM, Spread
+from training.fit import best_fit, support_of
 from training.misfit import measure_misfit
 from training.outlines import suitable
 
@@ -25,10 +25,7 @@ class UnseenReport:
     figures: dict[str, object]
     """Errors in mm, for the card."""
     misfit: Misfit
-    """How the outlines differ from their best fits."""
-    misfit_log_std: float
-    """Standard deviation of the logarithm of the size of the misfit: how much it varies by
-    object."""
+    """How outlines differ from their best fits."""
 
 
 def object_of(name: str) -> str:
@@ -49,15 +46,18 @@ def unseen_outlines(
 
 
 def measure_unseen(
-    shape: DeepSDFShape, outlines: dict[str, Float64[np.ndarray, "_ 2"]], seed: int = 0
+    shape: DeepSDFShape,
+    outlines: dict[str, Float64[np.ndarray, "_ 2"]],
+    trained: dict[str, Float64[np.ndarray, "_ 2"]],
+    seed: int = 0,
 ) -> UnseenReport:
-    """Fit every outline with and without scale and mount."""
+    """Fit every outline with and without scale and mount; `trained` are those of the training."""
     generator = torch.Generator().manual_seed(seed)
     with_scene = {n: best_fit(shape, v, generator) for n, v in outlines.items()}
     alone = {n: best_fit(shape, v, generator, scene=False) for n, v in outlines.items()}
     hull = {n: float(np.sqrt(np.square(f.hull_errors_mm).mean())) for n, f in with_scene.items()}
     sizes = np.array(list(hull.values()))
-    misfit, log_std = measure_misfit(with_scene.values()), float(np.log(sizes).std())
+    known = [MM * (support_of(_head(shape, n)) - support_of(v))[0] for n, v in trained.items()]
     figures: dict[str, object] = {
         "outlines": len(outlines),
         "best_fit_mm": vars(Spread.of(_pooled(with_scene))),
@@ -70,7 +70,12 @@ def measure_unseen(
         },
         "fitted": "latent, scale in [0.8, 1.2], mount within 20 mm and 0.2 rad",
     }
-    return UnseenReport(figures, misfit, log_std)
+    return UnseenReport(figures, measure_misfit(list(with_scene.values()), known))
+
+
+def _head(shape: DeepSDFShape, name: str) -> Float64[np.ndarray, "p 2"]:
+    """The outline that a training outline has become [m]."""
+    return shape.boundary_points(shape.code_of(name)).detach().numpy()
 
 
 def _pooled(fits: dict) -> np.ndarray:

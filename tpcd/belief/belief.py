@@ -179,11 +179,12 @@ def prior_belief(
 
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
     """The misfit field that belongs to a shape model."""
-    own = shape.misfit
-    sd = own.sd if settings.misfit_sd is None else settings.misfit_sd
+    own, sd, spread = shape.misfit, settings.misfit_sd, settings.misfit_spread
+    if sd is None:
+        sd, spread = own.sd, max(own.spread, spread)
     return MisfitField(
         sd=max(sd, settings.least_misfit_sd),
-        spread=settings.misfit_spread,
+        spread=spread,
         width=own.width,
         grain=own.grain,
         roughness=own.roughness,

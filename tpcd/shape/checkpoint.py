@@ -37,6 +37,7 @@ DENSITIES: dict[str, type[MaskDensity] | type[MixtureDensity]] = {
 }
 _MISFIT = {
     "misfit_sd_m": "sd",
+    "misfit_log_std": "spread",
     "misfit_width_rad": "width",
     "misfit_grain": "grain",
     "misfit_roughness_per_rad": "roughness",

@@ -110,8 +110,7 @@ class DeepSDFShape:
     names: tuple[str, ...] = ()
     """Names of the training outlines, in the order of `codes`."""
     misfit: Misfit = Misfit()
-    """How unseen outlines differ from their best fits; the card's `misfit_log_std` says how much
-    the logarithm of the size varies by object."""
+    """How outlines differ from their best fits."""
     card: Mapping[str, Any] = field(default_factory=dict)
     """The checkpoint's card: configuration, errors, provenance."""
     _copies: dict[tuple[torch.device, torch.dtype], DeepSDFNetwork] = field(

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from tpcd.shape.protocol import Misfit
 from tpcd.shape.outline import Outline, hull, points_at, resample_positions
+from tpcd.shape.protocol import Misfit
 
 CHUNK = 1 << 16
 """Point-edge pairs looked at together; few enough to stay in the processor's cache."""

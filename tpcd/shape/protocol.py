@@ -17,17 +17,17 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Misfit:
-    """How an outline that a family has not seen differs from the best one of it, seen from a flat
-    terrain: its support function is off by a random function of the angle, which `training.misfit`
-    measures.
+    """How an outline differs from the best one of a family, seen from a flat terrain: its support
+    function is off by a random function of the angle, which `training.misfit` measures.
 
-    The defaults of what follows the first are those of `ycb-rich`, for shapes of which nothing
-    was measured.
+    The defaults of the texture are those of `ycb-rich`, for shapes of which nothing was measured.
     """
 
     sd: float = 0.0
     """Standard deviation of its smooth part [m], in the median over outlines; 0 where the outline
     is exact."""
+    spread: float = 1.0
+    """Standard deviation of the logarithm of that standard deviation, by outline."""
     width: float = 0.137
     """Between two angles that has the correlation exp(-(a - b)^2 / (4 width^2)) [rad]."""
     grain: float = 0.1
@@ -37,10 +37,11 @@ class Misfit:
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
-        if min(self.sd, self.grain, self.roughness) < 0 or not 0 < self.width < float("inf"):
+        least = min(self.sd, self.spread, self.grain, self.roughness)
+        if least < 0 or not 0 < self.width < float("inf"):
             raise ValueError(
-                f"sd {self.sd}, grain {self.grain} and roughness {self.roughness} must be >= 0 "
-                f"and width {self.width} > 0"
+                f"sd {self.sd}, spread {self.spread}, grain {self.grain} and roughness "
+                f"{self.roughness} must be >= 0 and width {self.width} > 0"
             )
 
 
@@ -55,7 +56,7 @@ class Shape(Protocol):
 
     @property
     def misfit(self) -> Misfit:
-        """How outlines that the family has not seen differ from the best one of it."""
+        """How outlines differ from the best one of the family."""
         ...
 
     def signed_distance(

@@ -10,6 +10,7 @@ codes are fixed convex combinations of the learned ones and move with them.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +18,7 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from tpcd.shape.deepsdf import UNIT, Architecture, DeepSDFNetwork
-from training.config import TrainingConfig
+from training.config import NetworkConfig, TrainingConfig
 from training.data import Batch, Prepared
 from training.rates import cosine_rate, split_optimizers
 
@@ -144,12 +145,7 @@ def initial_network(prepared: Prepared, config: TrainingConfig) -> DeepSDFNetwor
     network = DeepSDFNetwork(architecture, len(prepared.names))
     generator = torch.Generator().manual_seed(config.optim.seed)
     with torch.no_grad():
-        for mlp in (network.sdf, network.head):
-            for layer in mlp:
-                if isinstance(layer, nn.Linear):
-                    bound = math.sqrt(6 / layer.in_features)
-                    layer.weight.uniform_(-bound, bound, generator=generator)
-                    layer.bias.uniform_(-math.pi, math.pi, generator=generator)
+        _draw_weights([network.sdf, network.head], generator)
         network.sdf[0].weight.uniform_(-1, 1, generator=generator)
         network.sdf[0].weight[:, :2].mul_(sizes.point_frequency)
         network.sdf[0].weight[:, 2:].mul_(sizes.latent_frequency)
@@ -160,3 +156,30 @@ def initial_network(prepared: Prepared, config: TrainingConfig) -> DeepSDFNetwor
             mlp[-1].bias.zero_()
         network.codes.copy_(prepared.codes)
     return network
+
+
+def with_new_head(network: DeepSDFNetwork, sizes: NetworkConfig, seed: int) -> DeepSDFNetwork:
+    """A network with the same signed distance and codes, and a head that has learnt nothing."""
+    architecture = replace(
+        network.architecture, head_width=sizes.head_width, head_depth=sizes.head_depth
+    )
+    fresh = DeepSDFNetwork(architecture, len(network.codes))
+    kept = {k: v for k, v in network.state_dict().items() if not k.startswith("head.")}
+    fresh.load_state_dict(kept, strict=False)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        _draw_weights([fresh.head], generator)
+        fresh.head[0].weight.uniform_(-1, 1, generator=generator)
+        fresh.head[0].weight.mul_(sizes.head_frequency)
+        fresh.head[-1].weight.mul_(0.3)
+        fresh.head[-1].bias.zero_()
+    return fresh
+
+
+def _draw_weights(networks: list[nn.Sequential], generator: torch.Generator) -> None:
+    for mlp in networks:
+        for layer in mlp:
+            if isinstance(layer, nn.Linear):
+                bound = math.sqrt(6 / layer.in_features)
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                layer.bias.uniform_(-math.pi, math.pi, generator=generator)

@@ -4,6 +4,9 @@ The head's points are brought onto f = 0 by Newton steps at many latents, and th
 these positions by least squares. That costs far less than evaluating f in every step, and
 what is left is the head's own resolution. It is spent on the distance from the level set:
 deviations along the outline change neither outline nor support and count little.
+
+What a head can learn is bounded by how fast outlines change with the latent: with six latents the
+distance of head and level set is another one after 0.05. So it takes many latents and steps.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ LEAST_SLOPE = 0.2
 """Where |grad f| is less, a step is as long as if it were this."""
 ALONG = 0.05
 """Weight of a squared deviation along the outline, against 1 across it."""
+CODES_SHARE = 0.05
+"""Least share of the latents that are codes, where training outlines are."""
 REACH = 0.04
 """Longest way from head point to target, in the networks' unit (4 mm)."""
 
@@ -38,10 +43,17 @@ def refine_head(
     The latents should be as the prior will draw them: between the latents of training the
     head strays further from the level set than at them.
     """
-    latents = torch.cat((latents, network.codes.detach().repeat(8, 1)))
+    latents = with_codes(latents, network)
     for stage in range(config.refine_rounds):
         targets = projected_outlines(network, latents)
-        _fit_head(network, latents, targets, config, stage)
+        fit_head(network, latents, targets, config, stage)
+
+
+def with_codes(latents: Float[Tensor, "m z"], network: DeepSDFNetwork) -> Float[Tensor, "n z"]:
+    """The latents, and copies of the codes as their share."""
+    codes = network.codes.detach()
+    copies = max(8, round(CODES_SHARE * len(latents) / len(codes)))
+    return torch.cat((latents, codes.repeat(copies, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +87,14 @@ def projected_outlines(network: DeepSDFNetwork, latents: Float[Tensor, "m z"]) -
     return HeadTargets(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
-def _fit_head(
+def fit_head(
     network: DeepSDFNetwork,
     latents: Tensor,
     targets: HeadTargets,
     config: OptimConfig,
     stage: int,
 ) -> None:
+    """Train the head in place on targets at `latents`; `stage` makes the random draws others."""
     generator = torch.Generator().manual_seed(config.seed + 2 + stage)
     optimizers = split_optimizers([network.head], [], config.adam_rate, config.muon_rate, 0.0)
     schedulers = [

@@ -14,13 +14,13 @@ class SamplerSettings:
 
     particles: int = 700
     """Particles kept of all draws."""
-    places: int = 70
+    places: int = 60
     """Places that each round of importance sampling puts components at."""
     draws_per_place: int = 5
     """Draws at each place."""
     rounds: int = 3
     """Rounds of importance sampling that shape the mixture."""
-    draws: int = 1500
+    draws: int = 1200
     """Draws from the mixture that the rounds arrived at, which are weighted."""
     prior_draws: int = 1500
     """Draws from the prior at the first datum, falling as 1 / k with datum k."""

@@ -48,17 +48,13 @@ class Calibration:
     """A built-in outline instead of the shape prior, and few particles."""
     misfit: float | None = None
     """Median of the outline error's standard deviation [m]; by default the prior's own figure."""
-    power: float = 1.0
-    """Power to which the default estimator takes the likelihood; below 1 intervals are wider."""
     particles: int = 0
     """Particles; 0 takes 700 (default) or 5000 (paper), with --quick 300 or 1000."""
     seed: int = 0
     """Run r takes seed + r."""
 
     def __post_init__(self) -> None:
-        above = {"misfit": 0.0, "power": 0.0}
-        if self.power > 1:
-            raise ValueError(f"power is {self.power:g}, expected at most 1")
+        above = {"misfit": 0.0}
         check_numbers(self, least={"runs": 1, "steps": 1, "particles": 0}, above=above)
 
 
@@ -163,7 +159,7 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     few = {"default": 300, "paper": 1000} if config.quick else {"default": 700, "paper": 5000}
     particles = config.particles or few[config.estimator]
     settings = EstimatorSettings(
-        sampler=SamplerSettings(particles=particles), misfit_sd=config.misfit, power=config.power
+        sampler=SamplerSettings(particles=particles), misfit_sd=config.misfit
     )
     generator = torch.Generator().manual_seed(seed)
     try:

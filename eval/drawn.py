@@ -7,7 +7,7 @@ Commands depend on earlier measurements only (tpcd/truth/motions.py), which no p
 minds, and the start pose is drawn without regard to theta and misfit, as long as the object is
 free there, which the likelihood knows, and near the floor, which the first data say. What is
 not exact: the filter's linearisation in the start pose and in what is not known of the misfit
-yet; the free start, where the draw leaves the grain out; a misfit so large that the angle at
+yet; a misfit so large that the angle at
 which it is read does not settle (some centimetres; keep `--misfit` to millimetres); the robust
 treatment of outliers and of bad parity, which concerns about 1 datum in 1000 each.
 """
@@ -61,7 +61,8 @@ def draw_episode(
         start[0] = -LEFTMOST_START * draw[0]
         start[1] = low + draw[1] * (high - low + HIGHEST_START)
         gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
-        floor_gap, wall_gap = gaps.amin(-1) + field.gap(coefficients, start[2])
+        left = misfit_sd * field.uncovered(field.basis(start[2])[0]).sqrt() * normal(terrains)
+        floor_gap, wall_gap = gaps.amin(-1) + field.gap(coefficients, start[2]) + left
         if 0 < floor_gap < LARGEST_GAP and wall_gap > 0:
             break
     vector = prior.to_vector(score)[0]

@@ -13,13 +13,11 @@ from linear_model import DIMENSION, LinearModel
 from short_episode import short_episode
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, refine
-from tpcd.belief.belief import EstimationStep, target_of
+from tpcd.belief.belief import EstimationStep
 from tpcd.belief.cloud import start_cloud
-from tpcd.belief.history import history_of
 from tpcd.belief.importance import assimilate
 from tpcd.belief.state import load_state
 from tpcd.belief.storage import load_belief
-from tpcd.belief.target import ContactTarget
 from tpcd.commands.estimation import run_estimation
 from tpcd.data.episode import Episode
 from tpcd.effects import find_effect
@@ -76,9 +74,6 @@ def test_the_closing_budget_has_the_particles_of_the_other_and_more_draws_for_ef
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("power", 0.0, "more than 0 and at most 1"),
-        ("power", 1.5, "more than 0 and at most 1"),
-        ("power", math.nan, "more than 0 and at most 1"),
         ("closing_passes", 0, "at least 1"),
         ("closing_worth", math.nan, "at least 0"),
     ],
@@ -86,17 +81,6 @@ def test_the_closing_budget_has_the_particles_of_the_other_and_more_draws_for_ef
 def test_settings_without_meaning_are_refused(name: str, value: float, expected: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is .*, expected {expected}"):
         EstimatorSettings(**{name: value})
-
-
-def test_the_likelihood_counts_to_its_power(episode: Episode, estimator: Estimator) -> None:
-    def target(power: float) -> ContactTarget:
-        settings = replace(SETTINGS, power=power)
-        return target_of(episode, estimator.shape, settings).given(history_of(episode))
-
-    score = target(1.0).sample(20, torch.Generator().manual_seed(5))
-    whole = target(1.0).log_likelihood(score, None)
-    assert whole.isfinite().any()
-    torch.testing.assert_close(target(0.6).log_likelihood(score, None), 0.6 * whole)
 
 
 def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(

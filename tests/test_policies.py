@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tpcd.belief import EstimatorSettings, SamplerSettings
-from tpcd.belief.belief import Belief, estimate, prior_belief
+from tpcd.belief.belief import Belief, prior_belief
 from tpcd.data.episode import Episode
 from tpcd.information import belief_outcomes, expected_information_gain
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
@@ -55,24 +55,6 @@ def belief(episode: Episode) -> Belief:
     settings = EstimatorSettings(sampler=SamplerSettings(particles=200))
     generator = torch.Generator().manual_seed(0)
     return prior_belief(episode, load_prior("ycb21-z2"), generator, settings)
-
-
-def test_what_is_expected_to_be_learnt_counts_as_what_is_learnt_does(
-    belief: Belief, episode: Episode
-) -> None:
-    start, down = row_at(episode, (0.0, 0.15, 0.0)), torch.tensor([[0.0, 0.0, 0.0]]).double()
-
-    def expected(power: float) -> float:
-        predictor = ContactPredictor(replace(belief, power=power), 60)
-        here = (start.poses[0], down, start.commands[0], episode.sensor_std)
-        return float(expected_information_gain(belief_outcomes(predictor, *here)[0]))
-
-    settings = EstimatorSettings(sampler=SamplerSettings(particles=20), power=0.8)
-    shape = load_prior("ycb21-z2")
-    before = prior_belief(episode, shape, torch.Generator().manual_seed(0), settings)
-    after = next(estimate(episode, shape, torch.Generator().manual_seed(0), settings)).belief
-    assert before.power == after.power == 0.8
-    assert 0.1 < expected(0.3) < 0.95 * expected(1.0)
 
 
 def test_what_limits_draw_back_is_told(episode: Episode, belief: Belief) -> None:

@@ -182,14 +182,6 @@ def test_particles_are_kept_by_weight(learnt) -> None:
     torch.testing.assert_close(prediction.std, expected.std)
 
 
-def test_a_belief_that_was_kept_knows_its_power(learnt, tmp_path: Path) -> None:
-    belief, _, _ = learnt
-    save_belief(replace(belief, power=0.4), tmp_path, "ycb21-z2")
-    kept = load_belief(tmp_path, belief.prior.shape)
-    assert kept.power == 0.4
-    torch.testing.assert_close(kept.vectors, belief.vectors)
-
-
 def test_a_folder_without_a_belief_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no such file; give the folder that estimate wrote"):
         load_belief(tmp_path)

@@ -62,11 +62,8 @@ class Belief:
     step: StepSettings
     stiffness: Float[Tensor, " 3"]
     log_evidence: float
-    """Of the likelihood to the power of `EstimatorSettings.power`."""
     log_evidence_std: float
     """Its standard error over the draws."""
-    power: float = 1.0
-    """To which the likelihood of each datum counts, also of those to come."""
 
     @property
     def parameters(self) -> Parameters:
@@ -132,7 +129,7 @@ def estimate(
 def target_of(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
     """The posterior to sample from, still without data."""
     prior = make_prior(shape, episode.priors, settings.effects)
-    return ContactTarget(prior, misfit_field(shape, settings), settings.step, power=settings.power)
+    return ContactTarget(prior, misfit_field(shape, settings), settings.step)
 
 
 def prior_belief(
@@ -159,7 +156,7 @@ def prior_belief(
     starts = start_gaps(scene.points_ee, setting, history.poses[:, 2], torch.tensor([0]))
     free = starts.log_free_before(misfit, sd).exp()
     tells = bool(rests_free(history)[0]) and float(free.max()) > _SOME_FREE
-    weights = free**settings.power if tells else torch.ones_like(free)
+    weights = free if tells else torch.ones_like(free)
     size = misfit.bumps * len(scene.terrains)
     return Belief(
         prior=prior,
@@ -173,7 +170,6 @@ def prior_belief(
         stiffness=episode.stiffness.double(),
         log_evidence=0.0,
         log_evidence_std=0.0,
-        power=target.power,
     )
 
 
@@ -207,5 +203,4 @@ def belief_of(cloud: Cloud, target: ContactTarget) -> Belief:
         stiffness=target.history.stiffness,
         log_evidence=cloud.log_evidence,
         log_evidence_std=cloud.log_evidence_std,
-        power=target.power,
     )

@@ -33,8 +33,9 @@ def systematic_resample(
     """
     cumulative = weights.double().cumsum(0)
     start = torch.rand((), generator=generator, dtype=torch.float64)
-    positions = (torch.arange(count, dtype=torch.float64) + start) / count * cumulative[-1]
-    index = torch.searchsorted(cumulative, positions.to(cumulative.device), right=True)
+    share = (torch.arange(count, dtype=torch.float64) + start) / count
+    positions = share.to(cumulative.device) * cumulative[-1]
+    index = torch.searchsorted(cumulative, positions, right=True)
     last = int(torch.nonzero(weights > 0).max())
     return index.clamp(max=last)
 
@@ -44,8 +45,9 @@ def multinomial_resample(
 ) -> Int[Tensor, " count"]:
     """Draw `count` independent ancestors."""
     cumulative = weights.double().cumsum(0)
-    positions = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]
-    index = torch.searchsorted(cumulative, positions.to(cumulative.device), right=True)
+    share = torch.rand(count, generator=generator, dtype=torch.float64)
+    positions = share.to(cumulative.device) * cumulative[-1]
+    index = torch.searchsorted(cumulative, positions, right=True)
     last = int(torch.nonzero(weights > 0).max())
     return index.clamp(max=last)
 

@@ -70,9 +70,6 @@ class EstimatorSettings:
     """Times at most that the closing draws are made, each from where the one before arrived."""
     closing_worth: float = 1000.0
     """Effective sample size with which they need not be made again."""
-    power: float = 1.0
-    """Power to which the likelihood is raised: below 1 the posterior is wider than Bayes' own, for
-    data that are known to be unlike the model (coarsened posteriors: Miller and Dunson 2019)."""
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""
     misfit_sd: float | None = None
@@ -91,8 +88,6 @@ class EstimatorSettings:
 
     def __post_init__(self) -> None:
         """Refuse choices without meaning."""
-        if not 0 < self.power <= 1:
-            raise ValueError(f"power is {self.power}, expected more than 0 and at most 1")
         if not self.closing_passes >= 1:
             raise ValueError(f"closing_passes is {self.closing_passes}, expected at least 1")
         if not self.closing_worth >= 0:

@@ -21,7 +21,7 @@ from tpcd.data.episode import Episode
 from tpcd.errors import RunError
 
 STATE_FILE = "state.safetensors"
-STATE_VERSION = "9"
+STATE_VERSION = "10"
 """Changes with what an estimator keeps, and with what its likelihoods mean."""
 
 

@@ -27,7 +27,7 @@ from tpcd.shape.checkpoint import find_prior, load_prior
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 _TENSORS = ("vectors", "weights", "misfit_sd", "misfit_mean", "misfit_covariance", "stiffness")
 
 
@@ -55,7 +55,6 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
             "step": asdict(belief.step),
             "log_evidence": belief.log_evidence,
             "log_evidence_std": belief.log_evidence_std,
-            "power": belief.power,
         },
     )
 
@@ -77,7 +76,6 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     try:
         prior, weights = card["prior"], card["prior_sha256"]
         misfit, step = MisfitField(**card["misfit"]), StepSettings(**card["step"])
-        power = float(card["power"])
         effects = effects_from_plain(card.get("effects", []), path)
         # JSON has no NaN: the filter `paper` estimates no evidence.
         evidence = {
@@ -105,7 +103,6 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         step=step,
         log_evidence=evidence["log_evidence"],
         log_evidence_std=evidence["log_evidence_std"],
-        power=power,
         **values,
     )
 

@@ -34,7 +34,8 @@ class ContactTarget:
     step: StepSettings
     history: History | None = None
     power: float = 1.0
-    """Power to which the likelihood is raised."""
+    """Power to which the likelihood is raised: below 1 the posterior is wider than Bayes' own, for
+    data that are known to be unlike the model (coarsened posteriors: Miller and Dunson 2019)."""
 
     def given(self, history: History) -> ContactTarget:
         """The same with a history."""

@@ -7,7 +7,7 @@ spherical cubature (McNamee and Stenger 1967; Arasaratnam and Haykin 2009): 2 k 
 distance sqrt(k), exact up to the third degree. In a linear normal model the divergence is
 quadratic in the noise, so that only the number of particles limits the answer. Nothing is
 drawn at random: permuting particles, or splitting one into two of half its weight, changes
-nothing. Where the belief takes likelihoods to a power below 1, w' does too, and less is gained.
+nothing.
 
 With m particles no gain exceeds log m. Everything is in the log domain.
 Axes: c commands, m particles, n outcomes that are looked at, k channels.
@@ -64,8 +64,8 @@ def expected_variance(
 def pair_log_likelihood(
     outcomes: Outcomes, noise: Float[Tensor, "p k"] | None = None
 ) -> tuple[Float[Tensor, "c n m"], Float[Tensor, "c n"]]:
-    """Log likelihood of each outcome that is looked at under every particle, times its power and
-    up to a constant common to all, and the probability of the outcome."""
+    """Log likelihood of each outcome that is looked at under every particle, up to a constant
+    common to all, and the probability of the outcome."""
     c, m, k = outcomes.mean.shape
     centre = (outcomes.weights[..., None] * outcomes.mean).sum(1, keepdim=True)
     mean = outcomes.mean - centre
@@ -86,7 +86,7 @@ def pair_log_likelihood(
         (precision[..., rows, columns] * double, pulled, constant[..., None]), dim=-1
     )
     share = outcomes.weights[..., None].expand(c, m, len(points)) / len(points)
-    return outcomes.power * (monomials @ coefficients.mT), share.flatten(1)
+    return monomials @ coefficients.mT, share.flatten(1)
 
 
 def reweight(
@@ -109,4 +109,4 @@ def split_commands(outcomes: Outcomes) -> list[Outcomes]:
     _, m, k = outcomes.mean.shape
     size = max(1, _NUMBERS_AT_ONCE // (2 * k * m * m))
     parts = (value.split(size) for value in (outcomes.mean, outcomes.factor, outcomes.weights))
-    return [Outcomes(*part, outcomes.power) for part in zip(*parts, strict=True)]
+    return [Outcomes(*part) for part in zip(*parts, strict=True)]

@@ -29,8 +29,6 @@ class Outcomes:
     """Cholesky factors of the covariances, lower triangular."""
     weights: Float[Tensor, "c m"]
     """Weights of the particles for each command, which sum to 1."""
-    power: float = 1.0
-    """To which the likelihood of what is read will count (`Belief.power`)."""
 
 
 def belief_outcomes(
@@ -57,7 +55,7 @@ def belief_outcomes(
         mean = torch.where(none[:, None, None], 0.0, mean)
         weights = torch.where(none[:, None], 1.0 / weights.shape[1], weights)
     factor = torch.linalg.cholesky(covariance)
-    return Outcomes(mean, factor, weights, predictor.belief.power), prediction
+    return Outcomes(mean, factor, weights), prediction
 
 
 def reading_variance(

@@ -6,7 +6,8 @@ import pytest
 import torch
 from scipy.stats import kstest
 
-from tpcd.belief.belief import Belief
+from tpcd.belief import EstimatorSettings
+from tpcd.belief.belief import Belief, misfit_field
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.parameters import DEFAULT_BOUNDS
@@ -14,6 +15,7 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.density import MaskDensity
 from tpcd.shape.polygon import PolygonShape
+from tpcd.shape.protocol import Misfit
 from tpcd.simulator import StepSettings
 
 
@@ -133,3 +135,22 @@ def test_gradient_of_the_log_prior_is_exact_and_its_precision_positive(name: str
     gradient, precision = prior.curvature(score.detach())
     torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=1e-6)
     assert (torch.linalg.eigvalsh(precision)[:, 0] > 0.99).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, (2e-3, 1.7)),
+        ({"misfit_spread": 0.0}, (2e-3, 0.0)),
+        ({"misfit_sd": 5e-4}, (5e-4, 1.0)),
+        ({"misfit_sd": 5e-4, "misfit_spread": 0.3}, (5e-4, 0.3)),
+        ({"least_misfit_spread": 2.0}, (2e-3, 2.0)),
+        ({"misfit_sd": 0.0}, (1e-4, 1.0)),
+    ],
+)
+def test_the_misfit_is_that_of_the_shape_where_nothing_else_is_said(settings, expected) -> None:
+    own = Misfit(2e-3, 1.7, 0.2, 0.06, 2.0)
+    shape = PolygonShape(builtin_outlines()["mug"], misfit=own)
+    field = misfit_field(shape, EstimatorSettings(**settings))
+    assert (field.sd, field.spread) == expected
+    assert (field.width, field.grain, field.roughness) == (0.2, 0.06, 2.0)

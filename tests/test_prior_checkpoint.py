@@ -59,11 +59,27 @@ def test_a_card_without_the_texture_of_the_misfit_takes_the_defaults(folder: Pat
     assert load_prior(folder).misfit == Misfit(sd=MISFIT.sd)
 
 
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 @pytest.mark.parametrize("key", ["misfit_sd_m", "misfit_width_rad", "misfit_roughness_per_rad"])
-def test_a_misfit_without_meaning_is_refused(folder: Path, key: str) -> None:
-    _edit_card(folder, **{key: -1.0})
-    with pytest.raises(CheckpointError, match="must be >= 0"):
+def test_a_misfit_without_meaning_is_refused(folder: Path, key: str, value: float) -> None:
+    _edit_card(folder, **{key: value})
+    with pytest.raises(CheckpointError, match="of the misfit is .*, expected a finite number"):
         load_prior(folder)
+
+
+def test_weights_of_a_larger_network_are_refused(folder: Path) -> None:
+    """Regression: layers that the card does not know were dropped without a word."""
+    _edit_tensors(folder, lambda t: t.update({"head.4.weight": torch.zeros(8, 8)}))
+    with pytest.raises(CheckpointError, match="holds the tensor 'head.4.weight'"):
+        load_prior(folder)
+
+
+def test_the_card_tells_the_size_of_the_weights_it_is_saved_with(folder: Path, tmp_path) -> None:
+    small = load_prior(folder)
+    deeper = Architecture(2, sdf_width=8, sdf_depth=2, head_width=8, head_depth=3, points=16)
+    network = DeepSDFNetwork(deeper, 3)
+    saved = save_prior(tmp_path / "deeper", network, small.density, small.names, MISFIT, small.card)
+    assert load_prior(saved).network.architecture == deeper
 
 
 def _edit_tensors(folder: Path, change) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from training.config import DataConfig, OptimConfig, TrainingConfig
 from training.evaluate import outline_errors
 from training.outlines import data_hash, mirrored, suitable, training_outlines
 from training.rates import cosine_rate, split_optimizers
+from training.reteach import Reteaching, reteach
 from training.train import Training, train_prior
 
 CONFIGS = Path(__file__).resolve().parents[1] / "training" / "configs"
@@ -106,6 +108,77 @@ def test_resuming_from_nothing_is_refused_in_one_line(
     message = capsys.readouterr().err.strip()
     assert "last.ckpt" in message
     assert "\n" not in message
+
+
+def recipe(folder: Path, **optim: object) -> Path:
+    """A small recipe with a deeper head."""
+    values = yaml.safe_load((CONFIGS / "builtin-z2.yaml").read_text())
+    values["network"] = {"head_width": 48, "head_depth": 4, "head_frequency": 3.0}
+    values["optim"] = {"refine_latents": 60, "refine_steps": 300, "threads": 1, **optim}
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+def reteach_by_command(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        run_command(
+            reteach, Reteaching, [str(a) for a in arguments], positional=("prior", "recipe")
+        )
+    return int(stopped.value.code or 0)
+
+
+@pytest.fixture
+def copied(run: Path, tmp_path: Path) -> Path:
+    """A prior to change."""
+    return Path(shutil.copytree(run / "builtin-z2", tmp_path / "prior"))
+
+
+def test_a_new_head_has_another_size_and_the_same_outlines(
+    run: Path, copied: Path, tmp_path: Path
+) -> None:
+    old = load_prior(copied)
+    assert reteach_by_command(copied, recipe(tmp_path), "--out", tmp_path / "out") == 0
+    new = load_prior(copied)
+    assert new.network.architecture.head_depth == 4 != old.network.architecture.head_depth
+    assert new.card["head"]["optim"]["refine_steps"] == 300
+    assert new.card["head_to_level_set_mm"] != old.card["head_to_level_set_mm"]
+    before, after = (shape.boundary_points(old.codes) for shape in (old, new))
+    # Taught for a moment only; a head that lost a layer on its way is off by centimetres.
+    assert float((after - before).norm(dim=-1).mean()) < 0.004
+    latent = old.codes[:, None].expand(-1, 128, -1)[:, 0]
+    torch.testing.assert_close(
+        new.signed_distance(before, latent), old.signed_distance(before, latent)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"network": {"latent_dim": 9}}, "has 2 latents, the recipe 9"),
+        ({"network": {"head_depth": "five"}}, "head_depth"),
+        ({"optim": {"nothing": 1}}, "nothing"),
+    ],
+)
+def test_a_recipe_that_does_not_fit_is_refused_and_the_prior_stays(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict, expected: str
+) -> None:
+    path = recipe(tmp_path)
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    before = (copied / "weights.safetensors").read_bytes()
+    assert reteach_by_command(copied, path, "--out", tmp_path / "out") != 0
+    error = capsys.readouterr().err.strip()
+    assert expected in error and len(error.splitlines()) == 1
+    assert (copied / "weights.safetensors").read_bytes() == before
+
+
+def test_a_prior_of_other_outlines_gets_no_new_head(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    card = json.loads((copied / "card.json").read_text())
+    (copied / "card.json").write_text(json.dumps(card | {"data_sha256": "0"}))
+    assert reteach_by_command(copied, recipe(tmp_path), "--out", tmp_path / "out") != 0
+    assert "other outlines than are here" in capsys.readouterr().err
 
 
 def test_unknown_outlines_are_refused_in_one_line(

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from training.fit import DIRECTIONS, Fit, support_of
+from training.evaluate import support_of
+from training.fit import HULL_DIRECTIONS as DIRECTIONS
+from training.fit import Fit
 from training.misfit import fit_variogram, measure_misfit, variogram
 
 ANGLE = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
@@ -52,7 +54,7 @@ def test_errors_without_a_memory_differ_by_twice_their_square() -> None:
 
 def test_slopes_are_derivatives_of_the_support_function() -> None:
     polygon = np.array([[0.05, 0.02], [-0.04, 0.03], [-0.05, -0.02], [0.04, -0.03]])
-    value, slope = support_of(polygon)
+    value, slope = support_of(polygon, DIRECTIONS)
     smooth = np.abs(np.diff(slope, append=slope[0])) < 1e-3
     smooth &= np.roll(smooth, 1)
     difference = (np.roll(value, -1) - np.roll(value, 1)) / (2 * ANGLE[1])

@@ -138,6 +138,8 @@ class OptimConfig:
     """Rounds of the last stage, in which the head learns the level set of the finished f."""
     refine_latents: int = 6000
     """Latents at which it does, spread as the prior will draw them."""
+    refine_copies: int = 8
+    """Copies of each code among them, since training outlines are to be met best."""
     refine_steps: int = 2000
     """Optimiser steps of each round."""
     seed: int = 0
@@ -149,7 +151,16 @@ class OptimConfig:
         _require(self, 1, "steps", "head_batch", "consistency_batch", "consistency_points")
         _require(self, 1, "refine_latents", "threads")
         _require(self, 2, "batch")
-        _require(self, 0, "refine_rounds", "refine_steps", "adam_rate", "muon_rate", "code_rate")
+        _require(
+            self,
+            0,
+            "refine_rounds",
+            "refine_steps",
+            "refine_copies",
+            "adam_rate",
+            "muon_rate",
+            "code_rate",
+        )
         if not 0 < self.between_share < 1:
             raise ValueError(f"between_share is {self.between_share}, expected between 0 and 1")
 

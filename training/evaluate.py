@@ -20,7 +20,7 @@ from tpcd.shape.levelset import decode, decode_many, decodes_plausibly
 
 MM = 1000.0
 DIRECTIONS = 180
-"""Directions in which support functions are compared."""
+"""Directions in which support functions are compared, all around."""
 BAND = 0.003
 """Half-width of the band around outlines in which the gradient norm is measured [m]."""
 
@@ -51,6 +51,18 @@ def uniform_points(
     return np.stack([np.interp(at, ends, closed[:, i]) for i in (0, 1)], axis=1)
 
 
+def support_of(
+    polygon: Float64[np.ndarray, "p 2"], directions: int = DIRECTIONS
+) -> Float64[np.ndarray, "2 k"]:
+    """Support function in so many directions all around [m], and its derivative by the angle, which
+    is where the outmost point lies along the edge of the half-plane that touches it."""
+    angle = np.linspace(0, 2 * np.pi, directions, endpoint=False)
+    outward = np.stack((np.cos(angle), np.sin(angle)))
+    along = np.stack((-np.sin(angle), np.cos(angle)))
+    outmost = polygon[(polygon @ outward).argmax(axis=0)].T
+    return np.stack(((outmost * outward).sum(0), (outmost * along).sum(0)))
+
+
 def outline_errors(
     shape: DeepSDFShape, latent: Float[Tensor, " z"], vertices: Float64[np.ndarray, "_ 2"]
 ) -> dict[str, Float64[np.ndarray, " _"]]:
@@ -67,7 +79,7 @@ def outline_errors(
     return {
         "level_set": MM * shapely.distance(level_set, shapely.points(true)),
         "head": MM * shapely.distance(shapely.LinearRing(head), shapely.points(true)),
-        "support": MM * (_support(head) - _support(vertices)),
+        "support": MM * (support_of(head)[0] - support_of(vertices)[0]),
     }
 
 
@@ -119,7 +131,7 @@ def support_errors(
         for _ in range(2):
             points = project(network, points, z).detach()
         traced = points.double().numpy() * UNIT
-        worst[index] = MM * np.abs(_support(heads[index]) - _support(traced)).max()
+        worst[index] = MM * np.abs(support_of(heads[index])[0] - support_of(traced)[0]).max()
     return worst
 
 
@@ -157,8 +169,3 @@ def measure_prior(
         "valid_share": plausible_share(shape, latents),
         "valid_draws": draws,
     }
-
-
-def _support(points: np.ndarray) -> np.ndarray:
-    angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    return (np.stack((np.cos(angle), np.sin(angle)), axis=1) @ points.T).max(axis=1)

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from tpcd.planar import transform_points
 from tpcd.shape.deepsdf import DeepSDFShape
-from training.evaluate import MM, uniform_points
+from training.evaluate import MM, support_of, uniform_points
 
 STARTS, STEPS = 4, 100
-DIRECTIONS = 1440
+HULL_DIRECTIONS = 1440
 """Directions in which support functions are compared: 4.4 mrad apart."""
 REACH = (0.2, 0.02, 0.02, 0.2)
 """Half-ranges of scale, mount x, mount z [m] and mount angle [rad]."""
@@ -37,7 +37,7 @@ class Fit:
     errors_mm: Float64[np.ndarray, " p"]
     """Distance of points along the true outline from the fitted polygon [mm]."""
     hull_errors_mm: Float64[np.ndarray, " k"]
-    """Support function of the fit minus that of the outline in `DIRECTIONS` [mm]: the change of
+    """Support function of the fit minus that of the outline in `HULL_DIRECTIONS` [mm]: the change of
     the gap that contact with a flat terrain feels."""
     hull_slopes_mm: Float64[np.ndarray, " k"]
     """Its derivative by the angle [mm]: how far contact is elsewhere along the terrain."""
@@ -88,17 +88,8 @@ def best_fit(
     distance = shapely.distance(
         shapely.LinearRing(fitted), shapely.points(uniform_points(vertices))
     )
-    hull, slopes = support_of(fitted) - support_of(vertices)
+    hull, slopes = support_of(fitted, HULL_DIRECTIONS) - support_of(vertices, HULL_DIRECTIONS)
     return Fit(z.double(), MM * distance, MM * hull, MM * slopes)
-
-
-def support_of(polygon: Float64[np.ndarray, "p 2"]) -> Float64[np.ndarray, "2 k"]:
-    """Support function in `DIRECTIONS` and its derivative by the angle, which is where the outmost
-    point lies along the edge of the half-plane that it touches."""
-    angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    outward, along = (np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))
-    outmost = polygon[(polygon @ np.stack(outward)).argmax(axis=0)]
-    return np.stack([(outmost * np.stack(axis, 1)).sum(1) for axis in (outward, along)])
 
 
 def _placed(shape: DeepSDFShape, latent: Tensor, free: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tpcd.cli import run
 from tpcd.errors import CheckpointError
@@ -19,6 +20,9 @@ from training.config import (
     OptimConfig,
     TrainingConfig,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True)
@@ -39,26 +43,40 @@ class Measuring:
 
 def measure(config: Measuring) -> None:
     """Measure a prior again and renew its card."""
-    import numpy as np
     import torch
 
-    from tpcd.shape.checkpoint import find_prior, load_prior
-    from training.outlines import data_hash, training_outlines
+    from tpcd.shape.checkpoint import find_prior
     from training.run import complete_card
 
     torch.set_num_threads(config.threads)
     folder = find_prior(config.prior)
+    trained, outlines = training_of(folder)
+    out = config.out or Path("runs") / f"measure-{folder.name}"
+    out.mkdir(parents=True, exist_ok=True)
+    complete_card(folder, outlines, trained, out)
+    print(f"card of {folder} renewed; figures in {out}")
+
+
+def training_of(folder: Path) -> tuple[TrainingConfig, dict[str, np.ndarray]]:
+    """Configuration and outlines [m] that a prior was trained with.
+
+    Raises CheckpointError where its card does not say so, or the outlines here are others.
+    """
+    import numpy as np
+
+    from tpcd.shape.checkpoint import load_prior
+    from training.outlines import data_hash, training_outlines
+
     card = load_prior(folder).card
+    if "configuration" not in card or "data_sha256" not in card:
+        raise CheckpointError(folder, "has a card without its training", "train it again")
     trained = config_of(dict(card["configuration"]))
     outlines = training_outlines(trained.data, np.random.default_rng(trained.optim.seed))
     if data_hash(outlines) != card["data_sha256"]:
         raise CheckpointError(
             folder, "was trained on other outlines than are here", "train it again"
         )
-    out = config.out or Path("runs") / f"measure-{folder.name}"
-    out.mkdir(parents=True, exist_ok=True)
-    complete_card(folder, outlines, trained, out)
-    print(f"card of {folder} renewed; figures in {out}")
+    return trained, outlines
 
 
 def config_of(saved: dict) -> TrainingConfig:

@@ -10,11 +10,11 @@ fitted with what the model of the estimator says (`tpcd.belief.misfit`),
 
     V(d) = 1 - s exp(-d^2 / (4 width^2)),    s = 1 / (1 + grain^2)  the share of the smooth part,
 
-over the angles between two readings that matter: from `NEAREST`, since grain is new at each
-reading, to the `FURTHEST` that the model covers. Relative to that of the smooth part, the mean
-square of its slope is 1 / (2 width^2); what the slope of e has more is roughness. Where a nearly
-flat face touches, e hardly changes while contact jumps from one end to the other, so slopes are
-far larger than a smooth function of the size of e would have.
+over the angles between two readings that matter most: from `NEAREST`, since grain is new at each
+reading, to `FURTHEST`, where the smooth part has forgotten most. Relative to that of the smooth
+part, the mean square of its slope is 1 / (2 width^2); what the slope of e has more is roughness.
+Where a nearly flat face touches, e hardly changes while contact jumps from one end to the other,
+so slopes are far larger than a smooth function of the size of e would have.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from scipy.optimize import least_squares
 from tpcd.shape.protocol import Misfit
 from training.fit import Fit
 
+LEAST_ERROR = 1e-3
+"""Smaller errors count as this [mm]; an exact fit would have no texture."""
 NEAREST, FURTHEST = 0.025, 0.45
 """Angles between two readings over which the variogram is fitted [rad]."""
 
@@ -36,13 +38,17 @@ def measure_misfit(fits: Sequence[Fit], trained: Sequence[Float64[np.ndarray, " 
     """Size and texture of the misfit, from best fits to unseen outlines and from the differences
     of the support functions of training outlines [mm]; the texture is in the median over outlines.
     """
-    sizes = np.array([_root_mean_square(fit.hull_errors_mm) for fit in fits])
+    if not fits or not trained:
+        raise ValueError(
+            f"got {len(fits)} unseen and {len(trained)} training outlines, expected some of both"
+        )
+    sizes = np.array([root_mean_square(fit.hull_errors_mm) for fit in fits])
     lags, variograms = zip(*(variogram(fit.hull_errors_mm) for fit in fits), strict=True)
-    steep = [_root_mean_square(f.hull_slopes_mm) / s for f, s in zip(fits, sizes, strict=True)]
+    steep = [root_mean_square(f.hull_slopes_mm) / s for f, s in zip(fits, sizes, strict=True)]
     width, grain = fit_variogram(lags[0], np.median(variograms, axis=0))
     whole = 1 + grain**2
     rough = float(np.median(steep)) ** 2 * whole - 1 / (2 * width**2)
-    logs = [np.log(sizes), np.log([_root_mean_square(error) for error in trained])]
+    logs = [np.log(sizes), np.log([root_mean_square(error) for error in trained])]
     mean = np.mean([group.mean() for group in logs])
     square = np.mean([np.square(group - mean).mean() for group in logs])
     sd = float(np.exp(mean)) / whole**0.5 / 1000.0
@@ -74,5 +80,6 @@ def fit_variogram(
     return width, (1 / share - 1) ** 0.5
 
 
-def _root_mean_square(values: Float64[np.ndarray, " k"]) -> float:
-    return float(np.sqrt(np.square(values).mean()))
+def root_mean_square(error_mm: Float64[np.ndarray, " k"]) -> float:
+    """Root mean square of an error [mm], at least `LEAST_ERROR`."""
+    return max(float(np.sqrt(np.square(error_mm).mean())), LEAST_ERROR)

@@ -145,15 +145,13 @@ def initial_network(prepared: Prepared, config: TrainingConfig) -> DeepSDFNetwor
     network = DeepSDFNetwork(architecture, len(prepared.names))
     generator = torch.Generator().manual_seed(config.optim.seed)
     with torch.no_grad():
-        _draw_weights([network.sdf, network.head], generator)
+        _draw_weights(network.sdf, generator)
+        _draw_weights(network.head, generator)
         network.sdf[0].weight.uniform_(-1, 1, generator=generator)
         network.sdf[0].weight[:, :2].mul_(sizes.point_frequency)
         network.sdf[0].weight[:, 2:].mul_(sizes.latent_frequency)
         network.head[0].weight.uniform_(-1, 1, generator=generator)
         network.head[0].weight.mul_(sizes.head_frequency)
-        for mlp in (network.sdf, network.head):
-            mlp[-1].weight.mul_(0.3)
-            mlp[-1].bias.zero_()
         network.codes.copy_(prepared.codes)
     return network
 
@@ -165,21 +163,21 @@ def with_new_head(network: DeepSDFNetwork, sizes: NetworkConfig, seed: int) -> D
     )
     fresh = DeepSDFNetwork(architecture, len(network.codes))
     kept = {k: v for k, v in network.state_dict().items() if not k.startswith("head.")}
-    fresh.load_state_dict(kept, strict=False)
+    fresh.load_state_dict(fresh.state_dict() | kept)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        _draw_weights([fresh.head], generator)
+        _draw_weights(fresh.head, generator)
         fresh.head[0].weight.uniform_(-1, 1, generator=generator)
         fresh.head[0].weight.mul_(sizes.head_frequency)
-        fresh.head[-1].weight.mul_(0.3)
-        fresh.head[-1].bias.zero_()
     return fresh
 
 
-def _draw_weights(networks: list[nn.Sequential], generator: torch.Generator) -> None:
-    for mlp in networks:
-        for layer in mlp:
-            if isinstance(layer, nn.Linear):
-                bound = math.sqrt(6 / layer.in_features)
-                layer.weight.uniform_(-bound, bound, generator=generator)
-                layer.bias.uniform_(-math.pi, math.pi, generator=generator)
+def _draw_weights(mlp: nn.Sequential, generator: torch.Generator) -> None:
+    """Weights of all layers; the first one's depend on what it takes."""
+    for layer in mlp:
+        if isinstance(layer, nn.Linear):
+            bound = math.sqrt(6 / layer.in_features)
+            layer.weight.uniform_(-bound, bound, generator=generator)
+            layer.bias.uniform_(-math.pi, math.pi, generator=generator)
+    mlp[-1].weight.mul_(0.3)
+    mlp[-1].bias.zero_()

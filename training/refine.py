@@ -29,8 +29,6 @@ LEAST_SLOPE = 0.2
 """Where |grad f| is less, a step is as long as if it were this."""
 ALONG = 0.05
 """Weight of a squared deviation along the outline, against 1 across it."""
-CODES_SHARE = 0.05
-"""Least share of the latents that are codes, where training outlines are."""
 REACH = 0.04
 """Longest way from head point to target, in the networks' unit (4 mm)."""
 
@@ -43,17 +41,18 @@ def refine_head(
     The latents should be as the prior will draw them: between the latents of training the
     head strays further from the level set than at them.
     """
-    latents = with_codes(latents, network)
+    latents = with_codes(latents, network, config)
     for stage in range(config.refine_rounds):
         targets = projected_outlines(network, latents)
         fit_head(network, latents, targets, config, stage)
 
 
-def with_codes(latents: Float[Tensor, "m z"], network: DeepSDFNetwork) -> Float[Tensor, "n z"]:
-    """The latents, and copies of the codes as their share."""
+def with_codes(
+    latents: Float[Tensor, "m z"], network: DeepSDFNetwork, config: OptimConfig
+) -> Float[Tensor, "n z"]:
+    """The latents, and some copies of each code."""
     codes = network.codes.detach()
-    copies = max(8, round(CODES_SHARE * len(latents) / len(codes)))
-    return torch.cat((latents, codes.repeat(copies, 1)))
+    return torch.cat((latents, codes.repeat(config.refine_copies, 1)))
 
 
 @dataclass(frozen=True, eq=False)

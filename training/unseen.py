@@ -12,9 +12,9 @@ from tpcd.shape.deepsdf import DeepSDFShape
 from tpcd.shape.protocol import Misfit
 from tpcd.shape.ycb import load_ycb, ycb_folder
 from training.config import DataConfig
-from training.evaluate import MM, Spread
-from training.fit import best_fit, support_of
-from training.misfit import measure_misfit
+from training.evaluate import MM, Spread, support_of
+from training.fit import HULL_DIRECTIONS, best_fit
+from training.misfit import measure_misfit, root_mean_square
 from training.outlines import suitable
 
 
@@ -55,9 +55,12 @@ def measure_unseen(
     generator = torch.Generator().manual_seed(seed)
     with_scene = {n: best_fit(shape, v, generator) for n, v in outlines.items()}
     alone = {n: best_fit(shape, v, generator, scene=False) for n, v in outlines.items()}
-    hull = {n: float(np.sqrt(np.square(f.hull_errors_mm).mean())) for n, f in with_scene.items()}
+    hull = {n: root_mean_square(f.hull_errors_mm) for n, f in with_scene.items()}
     sizes = np.array(list(hull.values()))
-    known = [MM * (support_of(_head(shape, n)) - support_of(v))[0] for n, v in trained.items()]
+    known = [
+        MM * (support_of(_head(shape, n), HULL_DIRECTIONS) - support_of(v, HULL_DIRECTIONS))[0]
+        for n, v in trained.items()
+    ]
     figures: dict[str, object] = {
         "outlines": len(outlines),
         "best_fit_mm": vars(Spread.of(_pooled(with_scene))),

@@ -176,8 +176,11 @@ def prior_belief(
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
     """The misfit field that belongs to a shape model."""
     own, sd, spread = shape.misfit, settings.misfit_sd, settings.misfit_spread
+    if spread is None:
+        measured = own.spread if sd is None else 0.0
+        spread = max(measured, settings.least_misfit_spread)
     if sd is None:
-        sd, spread = own.sd, max(own.spread, spread)
+        sd = own.sd
     return MisfitField(
         sd=max(sd, settings.least_misfit_sd),
         spread=spread,

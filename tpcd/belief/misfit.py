@@ -17,8 +17,8 @@ slope have errors of their own besides (`grain` and `roughness`), anew also wher
 not moved; nothing is learnt of them but how large they are together with the field.
 
 How far the true outline is from the best one of the prior differs by a factor of ten from
-object to object, so sd is itself unknown: log-normal around what the prior missed on outlines
-outside of its training, and learnt as one more entry of every particle.
+object to object, so sd is itself unknown: log-normal around what the prior misses on outlines
+inside and outside of its training, and learnt as one more entry of every particle.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class MisfitField:
     width: float = 0.15
     """Width and spacing of the bumps [rad]: how far the object turns until the error is another."""
     reach: float = 0.45
-    """The bumps cover angles within about +-reach [rad]; beyond, the error is independent noise."""
+    """The outermost bumps lie at the multiple of the width nearest to +-reach [rad]; beyond, the
+    error is independent noise."""
     grain: float = 0.0
     """Standard deviation of what each reading's gap has besides, as a share of the field's."""
     roughness: float = 0.0
@@ -64,7 +65,7 @@ class MisfitField:
         """Number of bumps for each terrain; none where the field is switched off."""
         if self.sd == 0:
             return 0
-        return 2 * round(self.reach / self.width) + 1
+        return 2 * max(1, round(self.reach / self.width)) + 1
 
     def sd_of(self, score: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Standard deviation of the outline error [m] from a standard normal score."""

@@ -75,9 +75,11 @@ class EstimatorSettings:
     misfit_sd: float | None = None
     """Median of the standard deviation of the outline misfit [m] before any datum; None takes
     the shape model's own figures, of the median and of the spread."""
-    misfit_spread: float = 1.0
-    """Standard deviation of the logarithm of that standard deviation, and the least for that of
-    the shape model: some objects are like none that it was measured on. 0 makes it known."""
+    misfit_spread: float | None = None
+    """Standard deviation of the logarithm of that standard deviation; 0 makes it known. None takes
+    that of the shape model, where it is more than the least, or the least for a given median."""
+    least_misfit_spread: float = 1.0
+    """Some objects are like none that the spread was measured on."""
     least_misfit_sd: float = 1e-4
     """The median is never taken to be less than this [m]."""
     effects: tuple[Effect, ...] = ()

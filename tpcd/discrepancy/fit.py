@@ -59,6 +59,7 @@ class Question:
             *(history.commands, history.readings, history.sensor_variance, history.stiffness),
             *(history.used, history.seams, history.parity_counts, scene.low, scene.high),
             *(type(scene.shape).__name__, scene.shape.latent_dim, scene.shape.misfit),
+            getattr(scene.shape, "card", {}).get("weights_sha256"),
             *(self.misfit, self.step, self.sampler, self.seed),
         )
 

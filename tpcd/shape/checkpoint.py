@@ -91,17 +91,18 @@ def save_prior(
     tensors = {name: value.detach().float() for name, value in network.state_dict().items()}
     tensors |= {f"density.{name}": value for name, value in density.tensors().items()}
     weights = save({name: value.contiguous().cpu() for name, value in tensors.items()})
-    full_card = {
+    own = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "name": folder.name,
         "architecture": dataclasses.asdict(network.architecture),
         "density": kind,
-        **card,
         **{key: getattr(misfit, name) for key, name in _MISFIT.items()},
         "outlines": list(names),
         "weights_sha256": hashlib.sha256(weights).hexdigest(),
     }
+    # What belongs to these weights wins over what an older card said.
+    full_card = own | dict(card) | own
     folder.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
     try:
@@ -150,9 +151,8 @@ def _read_card(path: Path) -> dict[str, Any]:
 
 def _misfit(card: Mapping[str, Any]) -> Misfit:
     """All but the size may be missing: nobody measured them, and they take their defaults."""
-    sd = float(card["misfit_sd_m"])
-    others = {name: float(card[key]) for key, name in _MISFIT.items() if key in card}
-    return Misfit(**others | {"sd": sd})
+    found = {name: float(card[key]) for key, name in _MISFIT.items() if key in card}
+    return Misfit(**found | {"sd": float(card["misfit_sd_m"])})
 
 
 def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:
@@ -169,6 +169,10 @@ def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:
 
 
 def _fill(network: DeepSDFNetwork, tensors: dict[str, Tensor], path: Path) -> None:
+    strangers = sorted(set(tensors) - set(network.state_dict()))
+    strangers = [name for name in strangers if not name.startswith("density.")]
+    if strangers:
+        raise CheckpointError(path, f"holds the tensor '{strangers[0]}' of other networks", _REMEDY)
     for name, target in network.state_dict().items():
         value = tensors.get(name)
         if value is None:

@@ -7,12 +7,16 @@ object frame at scale 1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+LEAST_WIDTH = 0.01
+"""Narrower bumps of the misfit field would be hundreds [rad]."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +28,8 @@ class Misfit:
     """
 
     sd: float = 0.0
-    """Standard deviation of its smooth part [m], in the median over outlines; 0 where the outline
-    is exact."""
+    """Standard deviation of its smooth part [m], in the geometric mean over outlines; 0 where the
+    outline is exact."""
     spread: float = 1.0
     """Standard deviation of the logarithm of that standard deviation, by outline."""
     width: float = 0.137
@@ -37,12 +41,12 @@ class Misfit:
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
-        least = min(self.sd, self.spread, self.grain, self.roughness)
-        if least < 0 or not 0 < self.width < float("inf"):
-            raise ValueError(
-                f"sd {self.sd}, spread {self.spread}, grain {self.grain} and roughness "
-                f"{self.roughness} must be >= 0 and width {self.width} > 0"
-            )
+        for name, value in vars(self).items():
+            least = LEAST_WIDTH if name == "width" else 0.0
+            if not least <= value < math.inf:
+                raise ValueError(
+                    f"{name} of the misfit is {value}, expected a finite number of at least {least}"
+                )
 
 
 @runtime_checkable

@@ -37,8 +37,8 @@ class Fit:
     errors_mm: Float64[np.ndarray, " p"]
     """Distance of points along the true outline from the fitted polygon [mm]."""
     hull_errors_mm: Float64[np.ndarray, " k"]
-    """Support function of the fit minus that of the outline in `HULL_DIRECTIONS` [mm]: the change of
-    the gap that contact with a flat terrain feels."""
+    """Support function of the fit minus that of the outline in `HULL_DIRECTIONS` [mm]: the change
+    of the gap that contact with a flat terrain feels."""
     hull_slopes_mm: Float64[np.ndarray, " k"]
     """Its derivative by the angle [mm]: how far contact is elsewhere along the terrain."""
 

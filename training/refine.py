@@ -29,6 +29,7 @@ LEAST_SLOPE = 0.2
 """Where |grad f| is less, a step is as long as if it were this."""
 ALONG = 0.05
 """Weight of a squared deviation along the outline, against 1 across it."""
+LATENTS_AT_ONCE = 250
 REACH = 0.04
 """Longest way from head point to target, in the networks' unit (4 mm)."""
 
@@ -69,8 +70,12 @@ class HeadTargets:
 
 def projected_outlines(network: DeepSDFNetwork, latents: Float[Tensor, "m z"]) -> HeadTargets:
     """Bring the head's points onto the zero level set."""
-    parts = []
-    for z in latents.split(250):
+    m, p = len(latents), network.architecture.points
+    # Made before anything else, so that what is kept does not lie between what is given back.
+    found = HeadTargets(torch.empty(m, p, 2), torch.empty(m, p, 2), torch.empty(m, p))
+    for first in range(0, m, LATENTS_AT_ONCE):
+        part = slice(first, first + LATENTS_AT_ONCE)
+        z = latents[part]
         start = points = network.outline(z).detach()
         for _ in range(PROJECTIONS):
             at = points.requires_grad_()
@@ -81,9 +86,9 @@ def projected_outlines(network: DeepSDFNetwork, latents: Float[Tensor, "m z"]) -
             step = value.detach()[..., None] / slope.clamp_min(LEAST_SLOPE)
             points = at.detach() - step * normal
         near = (points - start).norm(dim=-1) < REACH
-        counts = (step[..., 0].abs() < ACCURACY) & near
-        parts.append((points, normal, counts.float()))
-    return HeadTargets(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        found.points[part], found.normals[part] = points, normal
+        found.counts[part] = ((step[..., 0].abs() < ACCURACY) & near).float()
+    return found
 
 
 def fit_head(

@@ -80,7 +80,7 @@ def estimate_episode(config: Estimate) -> None:
         )
     with opened as folder:
         keep_model(model, folder, config.model)
-        state = load_state(folder, episode)
+        state = load_state(folder, episode, config.prior)
         settings = EstimatorSettings(
             sampler=SamplerSettings(particles=config.particles),
             step=model.step,

@@ -153,7 +153,7 @@ def test_a_run_ends_with_the_closing_draws_and_one_stopped_during_them_does_too(
         PRIOR,
         folder,
         show_progress=False,
-        state=load_state(folder, episode),
+        state=load_state(folder, episode, PRIOR),
         closing=estimator.closing,
     )
     expected = refine(episode, estimator.shape, steps[-1].state, SETTINGS)

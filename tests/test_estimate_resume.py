@@ -63,7 +63,7 @@ def test_a_stopped_estimation_goes_on_to_the_same_belief(
     # A line of a step whose state was not written any more.
     with (folder / "steps.jsonl").open("a") as file:
         file.write('{"step": 3, "cut')
-    state = load_state(folder, episode)
+    state = load_state(folder, episode, PRIOR)
     assert state is not None and state.index == 2
     again = run_estimation(
         steps(kind, episode, state), episode, PRIOR, folder, show_progress=False, state=state
@@ -78,16 +78,18 @@ def test_a_stopped_estimation_goes_on_to_the_same_belief(
 def test_a_state_of_other_data_or_version_or_cut_off_is_refused(
     episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert load_state(tmp_path, episode) is None
-    save_state(next(steps("default", episode)).state, tmp_path, episode)
+    assert load_state(tmp_path, episode, PRIOR) is None
+    save_state(next(steps("default", episode)).state, tmp_path, episode, PRIOR)
     with monkeypatch.context() as patch:
         patch.setattr("tpcd.belief.state.STATE_VERSION", "later")
         with pytest.raises(RunError, match="another version"):
-            load_state(tmp_path, episode)
+            load_state(tmp_path, episode, PRIOR)
+    with pytest.raises(RunError, match="other weights of the prior ycb-rich"):
+        load_state(tmp_path, episode, "ycb-rich")
     other = replace(episode, poses=episode.poses + 1e-4)
     with pytest.raises(RunError, match="other numbers"):
-        load_state(tmp_path, other)
+        load_state(tmp_path, other, PRIOR)
     path = tmp_path / "state.safetensors"
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(RunError, match="cannot be read"):
-        load_state(tmp_path, episode)
+        load_state(tmp_path, episode, PRIOR)

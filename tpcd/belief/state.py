@@ -19,6 +19,7 @@ from torch import Tensor
 
 from tpcd.data.episode import Episode
 from tpcd.errors import RunError
+from tpcd.shape.checkpoint import prior_hash
 
 STATE_FILE = "state.safetensors"
 STATE_VERSION = "10"
@@ -39,8 +40,9 @@ class EstimatorState:
         return dict(self.tensors)
 
 
-def save_state(state: EstimatorState, folder: Path, episode: Episode) -> None:
-    """Write the state in one move, with a fingerprint of the episode it belongs to."""
+def save_state(state: EstimatorState, folder: Path, episode: Episode, prior: str | Path) -> None:
+    """Write the state in one move, with fingerprints of the episode that it belongs to and of the
+    shape prior (its folder or name)."""
     target = folder / STATE_FILE
     content = {name: value.contiguous() for name, value in state.tensors.items()}
     content["generator"] = state.generator
@@ -48,17 +50,20 @@ def save_state(state: EstimatorState, folder: Path, episode: Episode) -> None:
         "version": STATE_VERSION,
         "index": str(state.index),
         "episode": fingerprint(episode),
+        "prior": prior_hash(prior),
     }
     staged = target.with_suffix(".staged")
     staged.write_bytes(save_tensors(content, card))
     os.replace(staged, target)
 
 
-def load_state(folder: Path, episode: Episode, growing: bool = False) -> EstimatorState | None:
+def load_state(
+    folder: Path, episode: Episode, prior: str | Path, growing: bool = False
+) -> EstimatorState | None:
     """Read the state back; None where no step was finished.
 
     With `growing`, the episode may have got further rows since. Raises `RunError`
-    where it belongs to other data or cannot be read.
+    where it belongs to other data or another prior, or cannot be read.
     """
     path = folder / STATE_FILE
     if not path.is_file():
@@ -74,6 +79,9 @@ def load_state(folder: Path, episode: Episode, growing: bool = False) -> Estimat
         raise RunError(path, f"cannot be read ({error})", "estimate again") from error
     if card.get("version") != STATE_VERSION:
         raise RunError(path, "was left by another version of tpcd", "estimate again")
+    if card.get("prior") != prior_hash(prior):
+        fault = f"was made with other weights of the prior {prior}"
+        raise RunError(path, fault, "estimate again")
     known = episode.first(index + 1) if growing else episode
     if of != fingerprint(known):
         raise RunError(path, "belongs to an episode with other numbers", "estimate again")

@@ -6,7 +6,6 @@ nothing under another prior.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from dataclasses import asdict
@@ -23,7 +22,7 @@ from tpcd.belief.prior import ParameterPrior
 from tpcd.effects.model import effects_from_plain, effects_to_plain
 from tpcd.errors import RunError
 from tpcd.files import read_json, write_json
-from tpcd.shape.checkpoint import find_prior, load_prior
+from tpcd.shape.checkpoint import load_prior, prior_hash
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
@@ -105,8 +104,3 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         log_evidence_std=evidence["log_evidence_std"],
         **values,
     )
-
-
-def prior_hash(prior: str | Path) -> str:
-    """SHA-256 of the weights of a shape prior."""
-    return hashlib.sha256((find_prior(prior) / "weights.safetensors").read_bytes()).hexdigest()

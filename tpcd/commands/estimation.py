@@ -110,7 +110,7 @@ class EstimationRun:
         self._lines.write(json.dumps(row) + "\n")
         self._lines.flush()
         save_belief(step.belief, self.folder, self._prior_name)
-        save_state(step.state, self.folder, episode)
+        save_state(step.state, self.folder, episode, self._prior_name)
         _log_scalars(self.writer, row, step)
         for name, value in (further or {}).items():
             if isinstance(value, float):

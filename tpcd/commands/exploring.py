@@ -77,7 +77,7 @@ def explore_in_folder(
         keep_model(model, folder, options.model)
         settings = EstimatorSettings(step=model.step, effects=model.informed)
         estimator = Estimator(shape, options.estimator, settings)
-        kept = _kept(folder, estimator) if options.resume else Kept()
+        kept = _kept(folder, estimator, options.prior) if options.resume else Kept()
         done = 0 if kept.state is None else kept.state.index
         if done >= options.steps and (folder / RESULTS_FILE).is_file():
             raise ValueError(f"{options.out} has all of its {options.steps} moves; raise --steps")
@@ -149,12 +149,12 @@ def _finish(
     )
 
 
-def _kept(folder: Path, estimator: Estimator) -> Kept:
+def _kept(folder: Path, estimator: Estimator, prior: str) -> Kept:
     path = folder / f"{EPISODE_NAME}.csv"
     if not path.is_file():
         return Kept()
     episode = read_episode(path)
-    state = load_state(folder, episode, growing=True)
+    state = load_state(folder, episode, prior, growing=True)
     if state is None:
         return Kept(episode)
     return Kept(episode, estimator.held(episode, state) or load_belief(folder), state)

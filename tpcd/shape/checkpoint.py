@@ -132,6 +132,11 @@ def find_prior(path_or_name: str | Path) -> Path:
     raise CheckpointError(given, f"holds no prior ({CARD} and {WEIGHTS})", known)
 
 
+def prior_hash(path_or_name: str | Path) -> str:
+    """SHA-256 of the weights of a prior given by path or by name."""
+    return hashlib.sha256((find_prior(path_or_name) / WEIGHTS).read_bytes()).hexdigest()
+
+
 def _read_card(path: Path) -> dict[str, Any]:
     try:
         card = json.loads(path.read_text(encoding="utf-8"))

@@ -300,3 +300,12 @@ def test_labels_name_the_unit_shown_and_keep_subscripts() -> None:
     assert axis_label("mount_phi", "rad") == "mount phi [°]"
     assert axis_label("$F_x$", "N") == "$F_x$ [N]"
     assert axis_label("scale", "1") == "scale [–]"
+
+
+def test_channels_of_one_curve_share_a_line_and_its_name() -> None:
+    transform = np.random.default_rng(0).uniform(size=(50, 2))
+    figure = figures.calibration(transform[:, [0, 1, 0]], ["x", "z", "F_x"])
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [label.split(" (")[0] for label in labels[:2]] == ["x, F_x", "z"]
+    # Two curves and the diagonal.
+    assert len(figure.axes[0].lines) == 3

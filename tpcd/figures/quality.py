@@ -40,20 +40,32 @@ def calibration(
         linewidth=0,
     )
     (ideal,) = panel.plot([0, 100], [0, 100], color=TRUTH, linestyle="--", linewidth=1.0)
-    lines = [
-        panel.plot(100 * levels, 100 * observed[:, i], color=SERIES[i % len(SERIES)])[0]
-        for i in range(len(names))
-    ]
+    entries: dict[str, LegendKey] = {}
+    for k, (sharing, curve) in enumerate(_distinct(names, observed)):
+        (line,) = panel.plot(100 * levels, 100 * curve, color=SERIES[k % len(SERIES)])
+        entries[f"{', '.join(sharing)} ({100 * curve[90]:.0f} % in 90 %)"] = line
     panel.set_xlim(0, 100)
     panel.set_ylim(0, 100)
     panel.set_aspect("equal")
     panel.set_xlabel("nominal level of the interval [%]")
     panel.set_ylabel("values observed inside [%]")
-    title(panel, f"below the diagonal: too sure (n = {count})")
-    shares = [f"{name} ({100 * observed[90, i]:.0f} % in 90 %)" for i, name in enumerate(names)]
-    entries = dict(zip(shares, lines, strict=True))
+    title(panel, f"below: too sure; above: not enough (n = {count})")
     legend_below(figure, entries | {"calibrated": ideal, "90 % by chance": band}, columns=2)
     return figure
+
+
+def _distinct(
+    names: Sequence[str], curves: Float[np.ndarray, "k c"]
+) -> list[tuple[list[str], Float[np.ndarray, " k"]]]:
+    """Each different curve with the names that share it, as pose and force do (F = K (x - u))."""
+    found: list[tuple[list[str], np.ndarray]] = []
+    for name, curve in zip(names, curves.T, strict=True):
+        same = next((shared for shared, other in found if np.array_equal(curve, other)), None)
+        if same is None:
+            found.append(([name], curve))
+        else:
+            same.append(name)
+    return found
 
 
 def central_coverage(

@@ -7,9 +7,9 @@ Commands depend on earlier measurements only (tpcd/truth/motions.py), which no p
 minds, and the start pose is drawn without regard to theta and misfit, as long as the object is
 free there, which the likelihood knows, and near the floor, which the first data say. What is
 not exact: the filter's linearisation in the start pose and in what is not known of the misfit
-yet; a misfit so large that the angle at
-which it is read does not settle (some centimetres; keep `--misfit` to millimetres); the robust
-treatment of outliers and of bad parity, which concerns about 1 datum in 1000 each.
+yet; a misfit so large that the angle at which it is read does not settle (some centimetres; keep
+`--misfit` to millimetres); the robust treatment of outliers and of bad parity, which concerns
+about 1 datum in 1000 each.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def variogram(
     step = 2 * np.pi / len(error)
     shifts = np.arange(round(NEAREST / step), round(FURTHEST / step) + 1)
     squares = [np.square(np.roll(error, -shift) - error).mean() for shift in shifts]
-    return shifts * step, np.array(squares) / (2 * np.square(error).mean())
+    return shifts * step, np.array(squares) / (2 * root_mean_square(error) ** 2)
 
 
 def fit_variogram(

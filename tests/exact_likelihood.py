@@ -1,4 +1,8 @@
-"""The likelihood of an episode without any linearisation, by importance sampling."""
+"""The likelihood of an episode without any linearisation, by importance sampling.
+
+What each reading's outline has besides the field (grain and roughness) is drawn anew in every
+step of every draw; that it acts linearly on the lever is its definition (`eval/drawn.py`).
+"""
 
 from __future__ import annotations
 
@@ -102,9 +106,9 @@ def _log_likelihood(
     for k in range(len(history)):
         angle = history.settled[k, 2]
         value, slope = field.basis(angle)
-        uncovered = (1 - (value**2).sum()).clamp_min(0.0).sqrt() * misfit_sd
-        noise = torch.randn(count, terrains, generator=generator, dtype=torch.float64)
-        gap = field.gap(coefficients, angle.expand(count)) + uncovered * noise
+        noise = torch.randn(2, count, terrains, generator=generator, dtype=torch.float64)
+        gap = field.gap(coefficients, angle.expand(count))
+        gap = gap + field.uncovered(value).sqrt() * misfit_sd * noise[0]
         settled = simulate_step(
             many.further(gap),
             pose,
@@ -114,6 +118,7 @@ def _log_likelihood(
             previous=history.previous[k],
         )
         lever = coefficients.reshape(count, terrains, -1) @ slope
+        lever = lever + field.roughness * misfit_sd * noise[1]
         pose = settled.pose + (settled.pose_from_lever * lever[..., None]).sum(-2)
         error, variance = angle_difference(history.settled[k], pose), history.variance[k + 1]
         each = -0.5 * error**2 / variance - 0.5 * (2 * math.pi * variance).log()

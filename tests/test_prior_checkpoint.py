@@ -16,7 +16,7 @@ from tpcd.shape.deepsdf import Architecture, DeepSDFNetwork
 from tpcd.shape.density import MaskDensity
 from tpcd.shape.protocol import Misfit
 
-SMALL = Architecture(2, sdf_width=8, sdf_depth=2, head_width=8, head_depth=1, points=16)
+SMALL = Architecture(2, width=8, depth=1, points=16)
 MISFIT = Misfit(0.002, 0.8, 0.2, 0.1, 5.0)
 
 
@@ -69,14 +69,14 @@ def test_a_misfit_without_meaning_is_refused(folder: Path, key: str, value: floa
 
 def test_weights_of_a_larger_network_are_refused(folder: Path) -> None:
     """Regression: layers that the card does not know were dropped without a word."""
-    _edit_tensors(folder, lambda t: t.update({"head.4.weight": torch.zeros(8, 8)}))
-    with pytest.raises(CheckpointError, match="holds the tensor 'head.4.weight'"):
+    _edit_tensors(folder, lambda t: t.update({"decoder.4.weight": torch.zeros(8, 8)}))
+    with pytest.raises(CheckpointError, match="holds the tensor 'decoder.4.weight'"):
         load_prior(folder)
 
 
 def test_the_card_tells_the_size_of_the_weights_it_is_saved_with(folder: Path, tmp_path) -> None:
     small = load_prior(folder)
-    deeper = Architecture(2, sdf_width=8, sdf_depth=2, head_width=8, head_depth=3, points=16)
+    deeper = Architecture(2, width=8, depth=3, points=16)
     network = DeepSDFNetwork(deeper, 3)
     saved = save_prior(tmp_path / "deeper", network, small.density, small.names, MISFIT, small.card)
     assert load_prior(saved).network.architecture == deeper
@@ -109,8 +109,10 @@ DEFECTS = {
         json.dumps({k: v for k, v in json.loads((f / CARD).read_text()).items() if k != "outlines"})
     ),
     "lacks or garbles 'pickle'": lambda f: _edit_card(f, density="pickle"),
-    "lacks the tensor 'sdf.0.weight'": lambda f: _edit_tensors(f, lambda t: t.pop("sdf.0.weight")),
-    "holds NaN": lambda f: _edit_tensors(f, lambda t: t["head.0.bias"].fill_(torch.nan)),
+    "lacks the tensor 'decoder.0.weight'": lambda f: _edit_tensors(
+        f, lambda t: t.pop("decoder.0.weight")
+    ),
+    "holds NaN": lambda f: _edit_tensors(f, lambda t: t["decoder.0.bias"].fill_(torch.nan)),
     "'codes' has shape": lambda f: _edit_tensors(f, lambda t: t.update(codes=torch.zeros(9, 2))),
     "density tensor": lambda f: _edit_tensors(f, lambda t: t.pop("density.cells")),
 }

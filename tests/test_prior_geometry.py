@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from tpcd.shape.builtin import builtin_outlines
 from training.config import LayoutConfig
 from training.correspondence import correspond, measure, round_corners
+from training.data import simple_morphs, with_as_many_vertices
 from training.layout import make_layout
-from training.polygons import sample_around, signed_distance
+from training.module import Targets
+from training.polygons import outward_normals, sample_around, support
 
 NAMES = ("mug", "banana", "drink_can", "juice_carton", "pear", "bowl", "wrench", "brick")
 
@@ -59,31 +61,65 @@ def test_where_an_outline_starts_does_not_matter(shift: int) -> None:
     assert np.abs(plain - rolled).max() < 0.002
 
 
-def test_polygon_distance_agrees_with_shapely(outlines: list[np.ndarray]) -> None:
-    rng = np.random.default_rng(0)
-    for vertices in outlines:
-        points = rng.uniform(-0.15, 0.15, (300, 2))
-        found, gradient = signed_distance(
-            torch.from_numpy(points)[None], torch.from_numpy(vertices.copy())[None]
-        )
-        polygon = shapely.Polygon(vertices)
-        away = shapely.distance(polygon.exterior, shapely.points(points))
-        inside = shapely.contains_xy(polygon, points[:, 0], points[:, 1])
-        np.testing.assert_allclose(found[0].numpy(), np.where(inside, -away, away), atol=1e-12)
-        np.testing.assert_allclose(gradient[0].norm(dim=-1).numpy(), 1.0, atol=1e-9)
-        # Walking back along the gradient by the distance ends on the outline.
-        landed = points - (found[0, :, None] * gradient[0]).numpy()
-        assert shapely.distance(polygon.exterior, shapely.points(landed)).max() < 1e-9
-
-
-def test_samples_lie_around_the_outlines(aligned: np.ndarray) -> None:
+def test_samples_lie_around_the_outlines_with_their_distance(aligned: np.ndarray) -> None:
     polygons = torch.from_numpy(aligned).float()
     generator = torch.Generator().manual_seed(0)
-    samples = sample_around(polygons, polygons, 400, (0.001, 0.01), 0.2, generator)
+    samples = sample_around(polygons, polygons, 400, (0.001, 0.01), generator)
     assert samples.points.shape == (len(NAMES), 400, 2)
-    near = samples.distance[:, :200].abs()
-    assert near.mean() < 0.001
-    assert (samples.points.abs() <= 0.26).all()
+    near, far = samples.distance[:, :280].abs(), samples.distance[:, 280:].abs()
+    assert near.mean() < 0.001 < 0.004 < far.mean() < 0.01
+    for vertices, points, distance in zip(aligned, samples.points, samples.distance, strict=True):
+        ring, at = shapely.LinearRing(vertices), shapely.points(points.double().numpy())
+        away = shapely.distance(ring, at)
+        np.testing.assert_allclose(distance.abs().numpy(), away, atol=1e-6)
+        inside = shapely.contains(shapely.Polygon(vertices), at)
+        clear = away > 1e-5
+        np.testing.assert_array_equal((distance < 0).numpy()[clear], inside[clear])
+
+
+def test_support_and_normals_of_a_circle() -> None:
+    angles = torch.arange(256) / 256 * 2 * torch.pi
+    circle = 0.05 * torch.stack((angles.cos(), angles.sin()), dim=-1)[None] + 0.01
+    found = support(circle, angles)
+    expected = 0.05 + 0.01 * (angles.cos() + angles.sin())
+    torch.testing.assert_close(found[0], expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(outward_normals(circle), (circle - 0.01) / 0.05, atol=1e-5, rtol=0)
+
+
+def test_errors_across_count_more_than_errors_along(aligned: np.ndarray) -> None:
+    targets = Targets.of(torch.from_numpy(aligned[:2]).float() * 10)
+    which = torch.arange(2)
+    assert float(targets.error(targets.points, which)) == 0.0
+    along = torch.stack((-targets.normals[..., 1], targets.normals[..., 0]), dim=-1)
+    shifted = targets.error(targets.points + 0.01 * targets.normals[:1, :1], which)
+    inflated = targets.error(targets.points + 0.01 * targets.normals, which)
+    slid = targets.error(targets.points + 0.01 * along, which)
+    # A shift leaves edges alone and lies partly across; both others turn or stretch edges.
+    assert shifted < inflated
+    assert slid < inflated
+    assert float(inflated) > 1e-4
+
+
+def test_no_morph_crosses_itself_and_few_are_changed(aligned: np.ndarray) -> None:
+    rng = np.random.default_rng(1)
+    # Beyond the outlines as well, where morphs do cross.
+    weights = 1.5 * rng.dirichlet(np.full(len(aligned), 0.3), 400) - 0.5 / len(aligned)
+    plain = np.einsum("mn,npc->mpc", weights, aligned)
+    morphs = simple_morphs(weights, aligned)
+    fine = shapely.is_valid(shapely.polygons(plain))
+    assert 0.3 < fine.mean() < 1
+    np.testing.assert_allclose(morphs[fine], plain[fine], atol=1e-15)
+    assert shapely.is_valid(shapely.polygons(morphs)).all()
+
+
+def test_added_vertices_change_no_polygon(outlines: list[np.ndarray]) -> None:
+    filled = with_as_many_vertices(outlines)
+    assert filled.shape[1] == max(len(vertices) for vertices in outlines)
+    for vertices, more in zip(outlines, filled, strict=True):
+        np.testing.assert_array_equal(more[: len(vertices)], vertices)
+        apart = shapely.Polygon(vertices).symmetric_difference(shapely.Polygon(more))
+        assert apart.area < 1e-12
+        assert (np.linalg.norm(np.roll(more, -1, 0) - more, axis=1) > 0).all()
 
 
 @pytest.mark.parametrize("latent_dim", [2, 3])

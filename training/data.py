@@ -13,19 +13,21 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Float64, Int
 from lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from tpcd.shape.deepsdf import UNIT
-from tpcd.shape.levelset import HALF_WIDTH
 from training.config import TrainingConfig
 from training.correspondence import correspond
 from training.layout import make_layout
 from training.mixture import Mixture
 from training.outlines import data_hash, training_outlines
 from training.polygons import Samples, sample_around
+
+ANGLES = 64
+"""Directions of one step in which support functions are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +45,14 @@ class Prepared:
     offsets: Float[Tensor, "m z"]
     mixture: Mixture | None
     """Density of the latents; None where it is uniform."""
+    true: Float[Tensor, "n v 2"]
+    """True outlines, filled up to the same number of vertices, in units of `UNIT`."""
     targets: Float[Tensor, "n p 2"]
-    """Head targets of the outlines, in units of `UNIT`."""
+    """Points that the decoder should give for the outlines."""
     morphs: Float[Tensor, "m p 2"]
-    """Head targets in between."""
-    simple: Bool[Tensor, " m"]
-    """Whether a morph does not cross itself; the others teach nothing."""
-    object_samples: Samples
-    between_samples: Samples
+    """Points that it should give in between."""
+    samples: Samples
+    """Points around the true outlines."""
 
 
 def prepare(config: TrainingConfig) -> Prepared:
@@ -64,12 +66,9 @@ def prepare(config: TrainingConfig) -> Prepared:
         vertices, layout_config.points, layout_config.rounding, layout_config.turning_share
     )
     layout = make_layout(aligned, config.network.latent_dim, layout_config, rng)
-    targets = _float(aligned / UNIT)
-    morphs = torch.einsum("mn,npc->mpc", _float(layout.outline_weights), targets)
-    simple = torch.from_numpy(shapely.is_valid(shapely.polygons(morphs.numpy())))
     spreads = (layout_config.near_spread / UNIT, layout_config.far_spread / UNIT)
-    half_width = HALF_WIDTH / UNIT
-    true = _float(_same_count(vertices) / UNIT)
+    targets = _float(aligned / UNIT)
+    true = _float(with_as_many_vertices(vertices) / UNIT)
     return Prepared(
         names=tuple(outlines),
         vertices=tuple(vertices),
@@ -78,33 +77,58 @@ def prepare(config: TrainingConfig) -> Prepared:
         weights=_float(layout.weights),
         offsets=_float(layout.offsets),
         mixture=layout.mixture,
+        true=true,
         targets=targets,
-        morphs=morphs,
-        simple=simple,
-        object_samples=sample_around(
-            targets, true, layout_config.object_samples, spreads, half_width, generator
-        ),
-        between_samples=sample_around(
-            morphs, morphs, layout_config.between_samples, spreads, half_width, generator
-        ),
+        morphs=_float(simple_morphs(layout.outline_weights, aligned) / UNIT),
+        samples=sample_around(targets, true, layout_config.object_samples, spreads, generator),
     )
 
 
+def simple_morphs(
+    weights: Float64[np.ndarray, "m n"], outlines: Float64[np.ndarray, "n p 2"]
+) -> Float64[np.ndarray, "m p 2"]:
+    """Combinations of outlines that do not cross themselves.
+
+    One that does moves towards the outline of its largest weight, by quarters of the way.
+    """
+    flat = outlines.reshape(len(outlines), -1)
+    plain = (weights @ flat).reshape(-1, *outlines.shape[1:])
+    nearest = outlines[weights.argmax(axis=1)]
+    morphs = plain.copy()
+    for share in (0.25, 0.5, 0.75, 1.0):
+        crossed = ~shapely.is_valid(shapely.polygons(morphs))
+        morphs[crossed] = plain[crossed] + share * (nearest[crossed] - plain[crossed])
+    return morphs
+
+
+def with_as_many_vertices(
+    outlines: list[Float64[np.ndarray, "_ 2"]],
+) -> Float64[np.ndarray, "n v 2"]:
+    """The same polygons with as many vertices as the largest; missing ones go on the last edge."""
+    most = max(len(vertices) for vertices in outlines)
+    filled = []
+    for vertices in outlines:
+        share = np.linspace(0, 1, most - len(vertices) + 1, endpoint=False)[1:, None]
+        last_edge = vertices[-1] + share * (vertices[0] - vertices[-1])
+        filled.append(np.vstack((vertices, last_edge)))
+    return np.stack(filled)
+
+
 class Batch(NamedTuple):
-    """Random indices of one step."""
+    """Random draws of one step."""
 
     outline: Int[Tensor, " s"]
-    outline_sample: Int[Tensor, " s"]
-    between: Int[Tensor, " s"]
-    between_sample: Int[Tensor, " s"]
-    head: Int[Tensor, " h"]
-    consistency: Int[Tensor, " c"]
-    consistency_outline: Int[Tensor, " c"]
-    consistency_start: Int[Tensor, " 1"]
+    """Outlines of the distances."""
+    sample: Int[Tensor, " s"]
+    """Which of their samples."""
+    between: Int[Tensor, " k"]
+    """Latents in between."""
+    angles: Float[Tensor, " a"]
+    """Directions of the support functions [rad]."""
 
 
 class _Draws(IterableDataset):
-    """Batches of random indices, from a step on, so that a resumed run sees the same ones."""
+    """Random batches; the same ones again where a run is resumed."""
 
     def __init__(self, prepared: Prepared, config: TrainingConfig) -> None:
         self.prepared, self.config = prepared, config
@@ -115,24 +139,13 @@ class _Draws(IterableDataset):
     def __iter__(self) -> Iterator[Batch]:
         data, optim = self.prepared, self.config.optim
         generator = torch.Generator().manual_seed(optim.seed + 1)
-        between = int(optim.between_share * optim.batch)
-        own = optim.batch - between
-        outlines, per_outline = data.object_samples.distance.shape
-        latents, per_latent = data.between_samples.distance.shape
-
-        def draw(high: int, count: int) -> Tensor:
-            return torch.randint(high, (count,), generator=generator)
-
+        outlines, samples = data.samples.distance.shape
         for _ in range(len(self)):
             yield Batch(
-                draw(outlines, own),
-                draw(per_outline, own),
-                draw(latents, between),
-                draw(per_latent, between),
-                draw(latents, optim.head_batch),
-                draw(latents, optim.consistency_batch),
-                draw(outlines, optim.consistency_batch),
-                draw(data.targets.shape[1], 1),
+                torch.randint(outlines, (optim.batch,), generator=generator),
+                torch.randint(samples, (optim.batch,), generator=generator),
+                torch.randint(len(data.morphs), (optim.latents,), generator=generator),
+                2 * torch.pi * torch.rand(ANGLES, generator=generator),
             )
 
 
@@ -150,9 +163,3 @@ class PriorData(LightningDataModule):
 
 def _float(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
-
-
-def _same_count(vertices: list[np.ndarray]) -> np.ndarray:
-    """Stack polygons of different vertex counts by repeating each last vertex."""
-    most = max(len(v) for v in vertices)
-    return np.stack([np.pad(v, ((0, most - len(v)), (0, 0)), mode="edge") for v in vertices])

@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tpcd.shape.deepsdf import DeepSDFShape
-from tpcd.shape.levelset import decode, decode_many
 
 MM = 1000.0
 BLUE, RED, GREY = "#1f6f9f", "#b3262a", "#c4c4c4"
@@ -82,11 +81,12 @@ def latent_map(shape: DeepSDFShape, per_side: int = 21) -> Figure:
     valid = shape.valid(latents)
     pitch = float(ticks[1] - ticks[0])
     factor = 0.9 * pitch / 0.25
-    axis.plot(*plane[~valid].T, "x", color=RED, markersize=4, label="not valid, never drawn")
-    for where, found in zip(plane[valid], decode_many(shape, latents[valid], 0.004), strict=True):
-        for curve in found.closed:
-            placed = factor * np.vstack((curve, curve[:1])) + where.numpy()
-            axis.plot(*placed.T, color=BLUE, linewidth=0.8)
+    if not valid.all():
+        axis.plot(*plane[~valid].T, "x", color=RED, markersize=4, label="not valid, never drawn")
+    decoded = shape.boundary_points(latents[valid]).detach().numpy()
+    for where, outline in zip(plane[valid].numpy(), decoded, strict=True):
+        placed = factor * np.vstack((outline, outline[:1])) + where
+        axis.plot(*placed.T, color=BLUE, linewidth=0.8)
     axis.plot([], [], color=BLUE, linewidth=0.8, label="decoded outline")
     axis.plot(*codes[:, :2].T, "o", color="black", markersize=4, label="training outline")
     if len(shape.names) <= 40:
@@ -121,12 +121,9 @@ def _draw_outline(
     latent = shape.code_of(name)
     closed = MM * np.vstack((vertices, vertices[:1]))
     axis.plot(*closed.T, color=GREY, linewidth=4, label="true outline")
-    label = "learned: zero level set of f"
-    for curve in decode(shape, latent).closed:
-        axis.plot(*(MM * np.vstack((curve, curve[:1])).T), color=BLUE, linewidth=1, label=label)
-        label = "_more"
-    head = MM * shape.boundary_points(latent).detach().numpy()
-    axis.plot(*head.T, ".", color=RED, markersize=point_size, label="learned: points of the head")
+    points = MM * shape.boundary_points(latent).detach().numpy()
+    axis.plot(*np.vstack((points, points[:1])).T, color=BLUE, linewidth=1, label="learned outline")
+    axis.plot(*points.T, ".", color=RED, markersize=point_size, label="its points")
     axis.set_aspect("equal")
 
 

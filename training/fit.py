@@ -2,7 +2,7 @@
 
 Unknown are the latent and, as in the estimation problem, a scale in [0.8, 1.2] and a mount
 (20 mm, 0.2 rad) within which the outline may sit. Minimised is the mean distance from the
-true outline to the head's polygon plus the mean difference of the support functions (what
+true outline to the decoded polygon plus the mean difference of the support functions (what
 contact with flat surroundings feels), by Adam from several starts at once; only valid
 latents count.
 """
@@ -93,7 +93,7 @@ def best_fit(
 
 
 def _placed(shape: DeepSDFShape, latent: Tensor, free: Tensor) -> Tensor:
-    """Head outlines scaled and mounted by bounded transforms of `free`."""
+    """Decoded outlines scaled and mounted by bounded transforms of `free`."""
     scale, x, z, angle = (torch.tanh(free) * torch.tensor(REACH)).unbind(-1)
     points = (1 + scale)[:, None, None] * shape.boundary_points(latent)
     return transform_points(torch.stack((x, z, angle), dim=-1), points)

@@ -1,4 +1,4 @@
-"""The optimisers and learning rates that all stages share.
+"""The optimisers and learning rates.
 
 Muon (see `muon`) moves the hidden matrices, Adam everything else; both follow a linear
 warm-up and half a cosine.
@@ -26,20 +26,17 @@ def cosine_rate(step: int, steps: int) -> float:
 
 
 def split_optimizers(
-    networks: list[nn.Sequential],
-    codes: list[nn.Parameter],
+    network: nn.Sequential,
+    codes: nn.Parameter,
     adam_rate: float,
     muon_rate: float,
     code_rate: float,
 ) -> list[torch.optim.Optimizer]:
-    """Adam for first layers, biases, one-row layers and codes; Muon for the other weights."""
-    linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in networks]
-    hidden = [layer.weight for mlp in linear for layer in mlp[1:] if len(layer.weight) > 1]
-    taken = {id(weight) for weight in hidden}
-    others = [p for mlp in networks for p in mlp.parameters() if id(p) not in taken]
-    groups = [{"params": others, "lr": adam_rate}]
-    if codes:
-        groups.append({"params": codes, "lr": code_rate})
+    """Adam for the first layer, biases and codes; Muon for the other weights."""
+    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
+    hidden = [layer.weight for layer in linear[1:]]
+    others = [linear[0].weight, *(layer.bias for layer in linear)]
+    groups = [{"params": others, "lr": adam_rate}, {"params": [codes], "lr": code_rate}]
     return [
         torch.optim.Adam(groups, betas=(0.9, 0.99)),
         Muon(hidden, lr=muon_rate),

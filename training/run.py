@@ -27,7 +27,6 @@ from training.data import Prepared, PriorData, prepare
 from training.evaluate import measure_prior
 from training.module import PriorModule
 from training.monitor import ErrorMonitor, log_figures
-from training.refine import refine_head
 from training.unseen import measure_unseen, unseen_outlines
 from training.validity import fit_mask, fit_truncated_mixture
 
@@ -45,7 +44,7 @@ def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False)
     Raises:
         RunError: `resume` without anything to resume from.
         FileError: the outlines are not there.
-        TrainingError: the trained networks decode to nothing.
+        TrainingError: the trained network decodes to nothing.
     """
     last = out / "last.ckpt"
     if resume and not last.is_file():
@@ -58,7 +57,6 @@ def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False)
     (out / "config.yaml").write_text(resolved, encoding="utf-8")
     module = PriorModule(prepared, config)
     _fit(module, prepared, config, out, last if resume else None)
-    refine_head(module.network, _latents_to_refine(module), config.optim)
     seconds = {
         "training_wall_seconds": round(time.perf_counter() - began, 1),
         "training_cpu_seconds": round(time.process_time() - began_cpu, 1),
@@ -117,7 +115,7 @@ def complete_card(
         misfit = report.misfit
     save_prior(folder, shape.network, shape.density, shape.names, misfit, card)
     by_outline = card["training_errors_by_outline_mean_p95_max"]
-    errors = {name: figures["level_set"][0] for name, figures in by_outline.items()}
+    errors = {name: figures["outline"][0] for name, figures in by_outline.items()}
     with SummaryWriter(str(out / "tensorboard")) as writer:
         log_figures(shape, outlines, errors, writer, out, config.optim.steps)
     return folder
@@ -151,12 +149,3 @@ def _fit(
         ckpt_path=str(resume) if resume else None,
         weights_only=True,
     )
-
-
-def _latents_to_refine(module: PriorModule) -> torch.Tensor:
-    """Latents spread as the prior will draw them: over the square, or from the mixture."""
-    optim, mixture = module.config.optim, module.data.mixture
-    rng = np.random.default_rng(optim.seed + 3)
-    count, z = optim.refine_latents, module.network.codes.shape[1]
-    drawn = rng.uniform(-1, 1, (count, z)) if mixture is None else mixture.draw(count, rng)
-    return torch.from_numpy(drawn).float().clamp(-1, 1)

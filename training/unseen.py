@@ -58,7 +58,7 @@ def measure_unseen(
     hull = {n: root_mean_square(f.hull_errors_mm) for n, f in with_scene.items()}
     sizes = np.array(list(hull.values()))
     known = [
-        MM * (support_of(_head(shape, n), HULL_DIRECTIONS) - support_of(v, HULL_DIRECTIONS))[0]
+        MM * (support_of(_decoded(shape, n), HULL_DIRECTIONS) - support_of(v, HULL_DIRECTIONS))[0]
         for n, v in trained.items()
     ]
     figures: dict[str, object] = {
@@ -76,7 +76,7 @@ def measure_unseen(
     return UnseenReport(figures, measure_misfit(list(with_scene.values()), known))
 
 
-def _head(shape: DeepSDFShape, name: str) -> Float64[np.ndarray, "p 2"]:
+def _decoded(shape: DeepSDFShape, name: str) -> Float64[np.ndarray, "p 2"]:
     """The outline that a training outline has become [m]."""
     return shape.boundary_points(shape.code_of(name)).detach().numpy()
 

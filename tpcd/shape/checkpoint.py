@@ -29,7 +29,7 @@ from tpcd.shape.density import LatentDensity, MaskDensity, MixtureDensity
 from tpcd.shape.protocol import Misfit
 
 FORMAT = "tpcd-prior"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 WEIGHTS, CARD = "weights.safetensors", "card.json"
 DENSITIES: dict[str, type[MaskDensity] | type[MixtureDensity]] = {
     "mask": MaskDensity,

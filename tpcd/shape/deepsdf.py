@@ -1,11 +1,12 @@
-"""A learned family of outlines: a DeepSDF with an outline head.
+"""A learned family of outlines: a DeepSDF whose level sets are polygons.
 
-Two plain multilayer perceptrons share one latent z in [-1, 1]^z. The signed distance
-f(p; z) (Park et al., "DeepSDF", CVPR 2019, arXiv 1901.05103, section 3; sine activations
-after Sitzmann et al., arXiv 2006.09661) defines the outline as its zero level set. The head
-g(z) gives p points that lie on that level set, in order and counter-clockwise, dense where
-the outline bends; it is trained together with f and costs 1/100 of finding them by search.
-Inside the networks lengths are in units of `UNIT`; at the door they are metres.
+One plain multilayer perceptron with sine activations (Sitzmann et al., arXiv 2006.09661)
+decodes a latent z in [-1, 1]^z to p outline points, in order and counter-clockwise, dense where
+the outline bends. The signed distance f(p; z) of the family (Park et al., "DeepSDF", CVPR 2019,
+arXiv 1901.05103, section 3: learned codes, an auto-decoder) is the exact distance to that
+polygon. So its zero level set is the polygon that the simulator touches, its gradient has norm
+one, and it has no stray level sets far away, none of which holds of a network that takes points.
+Inside the network lengths are in units of `UNIT`; at the door they are metres.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from tpcd.shape.density import LatentDensity
+from tpcd.shape.distance import polygon_distance
 from tpcd.shape.protocol import Misfit
 
 UNIT = 0.1
@@ -45,55 +47,41 @@ def sine_mlp(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential
 
 @dataclass(frozen=True)
 class Architecture:
-    """Sizes of the two networks."""
+    """Sizes of the decoder."""
 
     latent_dim: int
     """Size z of the latent."""
-    sdf_width: int = 128
-    """Units of each hidden layer of the signed distance."""
-    sdf_depth: int = 4
-    """Hidden layers of the signed distance."""
-    head_width: int = 128
-    """Units of each hidden layer of the outline head."""
-    head_depth: int = 3
-    """Hidden layers of the outline head."""
+    width: int = 256
+    """Units of each hidden layer."""
+    depth: int = 3
+    """Hidden layers."""
     points: int = 128
-    """Outline points p that the head gives."""
-    disc_radius: float = 0.0
-    """If positive, f is the distance to a disc of this radius [m] plus what the network
-    adds: right far away before any training, so that no stray level sets appear there."""
+    """Outline points p."""
 
 
 class DeepSDFNetwork(nn.Module):
-    """Weights of f and g and the codes of the training outlines; lengths in `UNIT`."""
+    """Weights of the decoder and the codes of the training outlines; lengths in `UNIT`."""
 
     def __init__(self, architecture: Architecture, codes: int) -> None:
         super().__init__()
         a = architecture
         self.architecture = a
-        self.sdf = sine_mlp(2 + a.latent_dim, a.sdf_width, a.sdf_depth, 1)
-        self.head = sine_mlp(a.latent_dim, a.head_width, a.head_depth, 2 * a.points)
+        self.decoder = sine_mlp(a.latent_dim, a.width, a.depth, 2 * a.points)
         self.codes = nn.Parameter(torch.zeros(codes, a.latent_dim))
 
-    def distance(
-        self, points: Float[Tensor, "*batch p 2"], latent: Float[Tensor, "*batch z"]
-    ) -> Float[Tensor, "*batch p"]:
-        """Signed distance f(p; z), all in units of `UNIT`."""
-        # The first layer acts on (p, z) = W_p p + W_z z; the latent's part is the same for
-        # all points of one latent, so it is computed once for each latent.
-        first = self.sdf[0]
-        from_points = points @ first.weight[:, :2].mT
-        from_latent = latent @ first.weight[:, 2:].mT + first.bias
-        learned = self.sdf[1:](from_points + from_latent[..., None, :])[..., 0]
-        if self.architecture.disc_radius <= 0:
-            return learned
-        # The root is softened by 5 mm: the distance to a point has a kink there.
-        radius = (points.square().sum(-1) + (0.005 / UNIT) ** 2).sqrt()
-        return radius - self.architecture.disc_radius / UNIT + learned
-
     def outline(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch p 2"]:
-        """Outline points g(z) in units of `UNIT`."""
-        return self.head(latent).unflatten(-1, (self.architecture.points, 2))
+        """Outline points in units of `UNIT`."""
+        return self.decoder(latent).unflatten(-1, (self.architecture.points, 2))
+
+    def distance(
+        self, points: Float[Tensor, "*batch s 2"], latent: Float[Tensor, "*batch z"]
+    ) -> Float[Tensor, "*batch s"]:
+        """Signed distance f(points; z) to the outline, all in units of `UNIT`."""
+        shape = torch.broadcast_shapes(points.shape[:-2], latent.shape[:-1])
+        polygons = self.outline(latent).expand(*shape, -1, -1)
+        s, p = points.shape[-2], self.architecture.points
+        together = points.expand(*shape, -1, -1).reshape(-1, s, 2)
+        return polygon_distance(together, polygons.reshape(-1, p, 2)).reshape(*shape, s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,26 +128,17 @@ class DeepSDFShape:
     def signed_distance(
         self, points_object: Float[Tensor, "*batch p 2"], latent: Float[Tensor, "*batch z"]
     ) -> Float[Tensor, "*batch p"]:
-        """Signed distance f to the outline [m], positive outside the object."""
+        """Signed distance to the outline of the latent [m], positive outside the object; exact,
+        with a gradient of norm one, see `polygon_distance`."""
         network = self._on(latent.device)
         dtype = network.codes.dtype
         distance = network.distance(points_object.to(dtype) / UNIT, latent.to(dtype))
         return (distance * UNIT).to(latent.dtype)
 
-    def boundary_points(
-        self, latent: Float[Tensor, "*batch z"], projections: int = 0
-    ) -> Float[Tensor, "*batch p 2"]:
-        """Outline points of the head [m], counter-clockwise, dense where the outline bends.
-
-        `projections` Newton steps p - f grad f / |grad f|^2 bring them closer to the zero
-        level set of f, at the cost of one evaluation of f with its gradient each.
-        """
+    def boundary_points(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch p 2"]:
+        """Outline points [m], counter-clockwise, dense where the outline bends."""
         network = self._on(latent.device)
-        z = latent.to(network.codes.dtype)
-        points = network.outline(z)
-        for _ in range(projections):
-            points = project(network, points, z)
-        return (points * UNIT).to(latent.dtype)
+        return (network.outline(latent.to(network.codes.dtype)) * UNIT).to(latent.dtype)
 
     def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
         """Whether the latent decodes to exactly one closed outline of plausible size."""
@@ -189,22 +168,3 @@ class DeepSDFShape:
         if key not in self._copies:
             self._copies[key] = copy.deepcopy(self.network).to(device)
         return self._copies[key]
-
-
-def project(
-    network: DeepSDFNetwork, points: Float[Tensor, "*batch p 2"], latent: Float[Tensor, "*batch z"]
-) -> Float[Tensor, "*batch p 2"]:
-    """One Newton step of points towards the zero level set of f, in units of `UNIT`.
-
-    The result is differentiable with respect to points and latent: autograd is on inside
-    whenever the caller asks for gradients, and the direction grad f is held constant, which
-    is exact on the level set (there f = 0, so the derivative of grad f / |grad f|^2 drops).
-    """
-    with torch.enable_grad():
-        at = points.detach().requires_grad_()
-        gradient = torch.autograd.grad(network.distance(at, latent.detach()).sum(), at)[0]
-    direction = gradient / gradient.square().sum(-1, keepdim=True).clamp_min(0.04)
-    step = network.distance(points, latent)[..., None] * direction
-    # A step longer than 5 mm means that the point is not near this level set; leave it.
-    length = step.detach().norm(dim=-1, keepdim=True)
-    return points - torch.where(length < 0.005 / UNIT, step, torch.zeros_like(step))

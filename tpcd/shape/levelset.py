@@ -19,7 +19,7 @@ from tpcd.shape.protocol import Shape
 
 HALF_WIDTH = 0.2
 """Half the side of the square that is searched for level sets [m]."""
-FINE = 0.0015
+FINE = 0.0005
 """Grid step at which a latent is finally judged [m]."""
 COARSENING = 4
 """Fine grid steps in one coarse step; the fine grid is evaluated only near the outline."""

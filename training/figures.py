@@ -106,7 +106,7 @@ def latent_map(shape: DeepSDFShape, per_side: int = 21) -> Figure:
     axis.set_aspect("equal")
     scale = f"distance between centres of neighbours: {MM * pitch / factor:.0f} mm"
     rest = "" if shape.latent_dim == 2 else ", other latents as at the nearest training outline"
-    axis.set_title(f"latent plane and what it decodes to{rest}; {scale}")
+    axis.set_title(f"latent plane and what it decodes to{rest}\n{scale}")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     return figure
 

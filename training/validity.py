@@ -29,8 +29,7 @@ class TrainingError(TpcdError):
 LARGEST_KNOT = 2e-3
 """A latent is not valid where its polygon crosses itself and loses more than this share of its
 area. Smaller knots come with points that crowd at a concave corner and change nothing; to refuse
-them all would drop good outlines with thin parts: with 1e-4, best fits to unseen outlines were two
-to three times as far off."""
+them all would drop good outlines with thin parts."""
 LEFT_OUT = 0.02
 """Least share of the mixture's draws that lie below the density floor."""
 PRECISION = 0.998

@@ -20,19 +20,17 @@ from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, Counted, Target
 from tpcd.belief.modes import Climbers, climb, find_modes, set_out
-from tpcd.belief.pareto import tail_shape
 from tpcd.belief.pool import (
     Pool,
     Proposal,
     cut_off,
     finite,
     known_weights,
+    tempered,
     threshold,
-    truncate,
     weigh,
 )
 from tpcd.belief.proposals import CurvedMixture, curved_mixture
-from tpcd.belief.resampling import systematic_resample
 from tpcd.belief.settings import SamplerSettings
 
 _LEAST_SHARE = 0.02
@@ -58,28 +56,8 @@ def assimilate(
     Raises ValueError where no particle can explain the datum at all.
     """
     pool = draw_pool(cloud, target, datum, settings, generator)
-    weights = truncate(known_weights(pool.log_weights))
-    index, counts = systematic_resample(weights, settings.particles, generator).unique(
-        return_counts=True
-    )
-    after = Cloud(
-        positions=pool.positions[index],
-        weights=counts.double() / settings.particles,
-        log_likelihood=pool.log_likelihood[index],
-        log_evidence=pool.log_evidence,
-        log_evidence_std=pool.log_evidence_std,
-        modes=pool.modes,
-        shares=pool.shares,
-    )
-    info = CloudInfo(
-        rounds=settings.rounds,
-        draws=len(pool.log_weights),
-        effective_sample_size=pool.effective_sample_size,
-        tail_shape=tail_shape(pool.log_weights),
-        distinct=len(index),
-        evaluations=pool.evaluations,
-    )
-    return after, info
+    after = pool.cloud(settings.particles, generator)
+    return after, pool.info(settings.rounds, len(after.weights))
 
 
 def draw_pool(
@@ -90,8 +68,27 @@ def draw_pool(
     generator: torch.Generator,
 ) -> Pool:
     """Adapt a mixture that starts at the cloud and the modes, and draw from it."""
+    adapted = adapt(cloud, target, datum, settings, generator)
+    return adapted.pool(target, settings.draws, generator)
+
+
+def adapt(
+    cloud: Cloud,
+    target: Target,
+    datum: int,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+    earlier: Adapted | None = None,
+) -> Adapted:
+    """A mixture that starts at the cloud and the modes, and goes to where the weight is.
+
+    With an `earlier` one its modes are taken for known, and its components are kept beside.
+    """
     target = Counted(target)
-    peaks = find_modes(target, cloud.modes, settings, generator)
+    if earlier is None:
+        peaks = find_modes(target, cloud.modes, settings, generator)
+    else:
+        peaks = earlier.peaks
     shares = cloud.shares
     counts = _counts(shares, settings.draws_per_place)
     mixture = CurvedMixture.joined(
@@ -109,15 +106,38 @@ def draw_pool(
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
         if left == 0:
             break
-        centres = trial.positions[spread_choice(log_weights, settings.places, generator)]
+        by_place = tempered(log_weights, trial.log_likelihood, settings.spread)
+        centres = trial.positions[spread_choice(by_place, settings.places, generator)]
         counts = _counts(shares, settings.draws_per_place)
         mixture = curved_mixture(centres, *target.curvature(centres), counts)
     assert trial.mixture is not None
     proposal = Proposal(trial.mixture, trial.from_prior)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
     best = float(trial.log_weights.topk(min(_TRUSTED, len(trial.positions))).values[-1])
-    drawn = weigh(target, proposal, settings.draws, best, generator)
-    return Pool(*drawn, peaks.points, shares, target.evaluations)
+    if earlier is not None:
+        proposal = earlier.proposal.beside(proposal)
+    spent = target.evaluations + (0 if earlier is None else earlier.evaluations)
+    return Adapted(proposal, best, peaks, shares, spent)
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """What to draw from, and what was learnt on the way."""
+
+    proposal: Proposal
+    best: float
+    """A log weight that some draws reach."""
+    peaks: Climbers
+    shares: Tensor
+    """What draws with each damping were worth."""
+    evaluations: int
+
+    def pool(self, target: Target, count: int, generator: torch.Generator) -> Pool:
+        """So many weighted draws."""
+        target = Counted(target)
+        drawn = weigh(target, self.proposal, count, self.best, generator)
+        spent = self.evaluations + target.evaluations
+        return Pool(*drawn, self.peaks.points, self.shares, spent)
 
 
 def _counts(shares: Tensor, total: int) -> Tensor:

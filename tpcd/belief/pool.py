@@ -9,9 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.cloud import Target
+from tpcd.belief.cloud import Cloud, CloudInfo, Target
+from tpcd.belief.pareto import tail_shape
 from tpcd.belief.proposals import CurvedMixture
-from tpcd.belief.resampling import effective_sample_size, normalise_log_weights
+from tpcd.belief.resampling import (
+    effective_sample_size,
+    normalise_log_weights,
+    systematic_resample,
+)
 
 _HOPELESS = 20.0
 """A draw whose log weight is so far below the best one counts as impossible."""
@@ -23,6 +28,11 @@ class Proposal:
 
     mixture: CurvedMixture
     from_prior: int
+
+    def beside(self, other: Proposal) -> Proposal:
+        """Both together."""
+        mixture = CurvedMixture.joined([self.mixture, other.mixture])
+        return Proposal(mixture, self.from_prior + other.from_prior)
 
     def log_density(
         self, positions: Float[Tensor, "n d"], log_prior: Float[Tensor, " n"]
@@ -72,6 +82,35 @@ class Pool:
         spread = 1.0 / self.effective_sample_size - 1.0 / len(self.log_weights)
         return math.sqrt(max(spread, 0.0))
 
+    def cloud(self, particles: int, generator: torch.Generator, power: float = 1.0) -> Cloud:
+        """So many particles drawn by weight, or by weights with a `power` of the likelihood."""
+        log_weights = tempered(self.log_weights, self.log_likelihood, power)
+        weights = truncate(known_weights(log_weights))
+        index, counts = systematic_resample(weights, particles, generator).unique(
+            return_counts=True
+        )
+        return Cloud(
+            positions=self.positions[index],
+            weights=counts.double() / particles,
+            log_likelihood=self.log_likelihood[index],
+            log_evidence=self.log_evidence,
+            log_evidence_std=self.log_evidence_std,
+            modes=self.modes,
+            shares=self.shares,
+        )
+
+    def info(self, rounds: int, distinct: int) -> CloudInfo:
+        """What the draws cost and are worth, where so many rounds shaped the mixture and so many
+        of the draws are particles."""
+        return CloudInfo(
+            rounds=rounds,
+            draws=len(self.log_weights),
+            effective_sample_size=self.effective_sample_size,
+            tail_shape=tail_shape(self.log_weights),
+            distinct=distinct,
+            evaluations=self.evaluations,
+        )
+
 
 def weigh(
     target: Target,
@@ -98,6 +137,13 @@ def threshold(best: float, density: Tensor, log_prior: Tensor) -> Tensor:
     """Log likelihood from which a draw is worth weighing; infinite where the prior is zero."""
     least = best - _HOPELESS + density - log_prior
     return torch.where(torch.isfinite(log_prior), least, torch.inf)
+
+
+def tempered(
+    log_weights: Float[Tensor, " n"], log_likelihood: Float[Tensor, " n"], power: float
+) -> Float[Tensor, " n"]:
+    """Log weights with a power of the likelihood in place of the likelihood itself."""
+    return finite(log_weights - (1 - power) * log_likelihood)
 
 
 def finite(log_weights: Tensor) -> Tensor:

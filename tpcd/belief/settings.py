@@ -36,6 +36,9 @@ class SamplerSettings:
     """Newton steps before the lower half of those gives up."""
     following_rounds: int = 3
     """Newton steps of the modes that are remembered, and of those that did not give up."""
+    spread: float = 1.0
+    """Power of the likelihood in the weights that places are chosen by: below 1 they lie further
+    apart than the draws that count, so that the mixture does not end before the posterior does."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
@@ -54,10 +57,18 @@ class SamplerSettings:
         for name, limit in least.items():
             if not getattr(self, name) >= limit:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
+        if not 0 < self.spread <= 1:
+            raise ValueError(f"spread is {self.spread}, expected above 0 and at most 1")
 
 
 CLOSING_SAMPLER = SamplerSettings(
-    places=320, draws_per_place=9, draws=12_000, modes=80, fresh_modes=480
+    places=320,
+    draws_per_place=9,
+    rounds=6,
+    draws=30_000,
+    modes=80,
+    fresh_modes=480,
+    spread=0.3,
 )
 """Budget of the belief that is left once no more data are to come."""
 
@@ -70,10 +81,11 @@ class EstimatorSettings:
     """Budget of the sampler after each transition."""
     closing: SamplerSettings = CLOSING_SAMPLER
     """Budget once no more data are to come (see `refine`), for as many particles as the other."""
-    closing_passes: int = 4
-    """Times at most that the closing draws are made, each from where the one before arrived."""
+    closing_passes: int = 2
+    """Times at most that the mixture of the closing draws is adapted, each time from where draws of
+    the one before lie."""
     closing_worth: float = 1000.0
-    """Effective sample size with which they need not be made again."""
+    """Effective number of closing draws with which it need not be adapted again."""
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""
     misfit_sd: float | None = None

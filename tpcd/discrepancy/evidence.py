@@ -18,8 +18,6 @@ from torch import Tensor
 from tpcd.belief.cloud import Cloud, start_cloud
 from tpcd.belief.importance import draw_pool
 from tpcd.belief.modes import find_modes
-from tpcd.belief.pool import known_weights, truncate
-from tpcd.belief.resampling import systematic_resample
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
@@ -78,20 +76,7 @@ def _fitted(
     if places is not None:
         remembered.append(places)
     begin = replace(begin, modes=torch.cat(remembered))
-    pool = draw_pool(begin, target, 1, sampler, generator)
-    weights = truncate(known_weights(pool.log_weights))
-    index, counts = systematic_resample(weights, sampler.particles, generator).unique(
-        return_counts=True
-    )
-    return Cloud(
-        pool.positions[index],
-        counts.double() / sampler.particles,
-        pool.log_likelihood[index],
-        pool.log_evidence,
-        pool.log_evidence_std,
-        pool.modes,
-        pool.shares,
-    )
+    return draw_pool(begin, target, 1, sampler, generator).cloud(sampler.particles, generator)
 
 
 def _early_modes(

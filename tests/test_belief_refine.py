@@ -114,10 +114,12 @@ def test_the_mixture_is_adapted_again_while_too_few_draws_count(
     again = spent[1] - spent[0], spent[2] - spent[1]
     assert 500 < again[0] < spent[0] and 0.8 < again[1] / again[0] < 1.25
     assert [each.info.draws for each in (one, two, three)] == [3000] * 3
+    rounds = SETTINGS.closing.rounds
+    assert [each.info.rounds for each in (one, two, three)] == [rounds, 2 * rounds, 3 * rounds]
     assert not torch.equal(one.belief.vectors, two.belief.vectors)
     # Where the draws after the first pass already count enough, it is the only one.
     enough = closed(3, 1e-9)
-    assert enough.info.evaluations == spent[0] + 500
+    assert enough.info.evaluations == spent[0] + 500 and enough.info.rounds == rounds
     assert len(enough.belief.vectors) > 1
 
 

@@ -14,6 +14,7 @@ from tpcd.exploration import Estimator
 from tpcd.shape.checkpoint import load_prior
 
 SEEDS = (92001, 92006, 92015)
+"""Of episodes where draws from the prior find the posterior; nothing else was asked of them."""
 DRAWS, AT_ONCE = 200_000, 20_000
 SETTINGS = EstimatorSettings(misfit_sd=1e-4, misfit_spread=0.0)
 

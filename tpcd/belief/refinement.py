@@ -60,7 +60,8 @@ def refine(
     assert adapted is not None
     pool = adapted.pool(target, budget.draws, generator)
     cloud = pool.cloud(budget.particles, generator)
-    belief, info = belief_of(cloud, target), pool.info(budget.rounds, len(cloud.weights))
+    rounds = (settings.closing_passes - left) * budget.rounds
+    belief, info = belief_of(cloud, target), pool.info(rounds, len(cloud.weights))
     return EstimationStep(state.index, belief, info, time.perf_counter() - started, state)
 
 

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from linear_model import DIMENSION, LinearModel, LinearTarget
+from torch import Tensor
 
-from eval.calibration import Calibration, calibrate, coverage_table
+from eval.calibration import Calibration, calibrate, coverage_by_misfit, coverage_table
+from eval.conditional import conditional_places
 from eval.drawn import draw_episode
 from eval.lines import append_lines, read_lines, write_line
 from tpcd.belief.belief import misfit_field
@@ -23,6 +26,11 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 
 
+def normal_target(precision: Tensor) -> LinearTarget:
+    """Standard normal entries, and a likelihood of so much precision about zero."""
+    return LinearModel(1).target(1, lambda x: -0.5 * ((x @ precision) * x).sum(-1))
+
+
 def test_uniform_places_pass_and_narrow_posteriors_fail() -> None:
     generator = np.random.default_rng(0)
     places = np.stack((generator.uniform(size=1000), generator.beta(0.5, 0.5, size=1000)), axis=1)
@@ -30,6 +38,55 @@ def test_uniform_places_pass_and_narrow_posteriors_fail() -> None:
     assert good["within_50"] and good["within_90"] and good["p_uniform"] > 0.01
     assert narrow["inside_90"] < narrow["low_90"]
     assert narrow["p_uniform"] < 1e-6
+
+
+def test_coverage_is_told_by_the_size_of_the_true_misfit() -> None:
+    """Of 400 runs those with a large misfit have places at the ends only, and one is small."""
+    generator = np.random.default_rng(0)
+    places, scores = generator.uniform(size=(400, 9)), generator.uniform(-0.9, 2.0, size=400)
+    places[scores > 1] = np.where(places[scores > 1] < 0.5, 0.01, 0.99)
+    scores[0] = -3.0
+    usual, large = coverage_by_misfit(places.tolist(), scores.tolist())
+    assert usual["true_misfit"] == "usual" and large["true_misfit"] == "large"
+    assert usual["runs"] + large["runs"] == 399
+    assert abs(usual["inside_90"] - 0.9) < 4 * usual["se_90"] < 0.05
+    assert abs(usual["inside_50"] - 0.5) < 4 * usual["se_50"] < 0.1
+    assert large["inside_90"] == large["inside_50"] == large["se_90"] == 0
+
+
+def test_places_given_all_other_entries_are_those_of_a_normal_posterior() -> None:
+    """Whether an entry is known to 1 or to 0.003 standard deviations of its prior."""
+    scale = torch.ones(DIMENSION).double()
+    scale[1] = 300.0
+    shared = 0.5 * torch.ones(DIMENSION, DIMENSION).double() + torch.eye(DIMENSION)
+    added = scale * shared * scale[:, None]
+    precision = added + torch.eye(DIMENSION)
+    for seed in range(5):
+        generator = torch.Generator().manual_seed(seed)
+        normal = torch.randn(DIMENSION, generator=generator, dtype=torch.float64)
+        truth = torch.linalg.solve(torch.linalg.cholesky(precision).mT, normal)
+        # Given all others entry i has the precision P_ii, and (P x)_i = P_ii (x_i - its mean).
+        expected = torch.special.ndtr((precision @ truth) / precision.diagonal().sqrt())
+        assert (conditional_places(normal_target(added), truth) - expected).abs().max() < 0.01
+
+
+def test_no_place_where_nothing_explains_the_data() -> None:
+    target = normal_target(torch.full((DIMENSION, DIMENSION), torch.nan).double())
+    with pytest.raises(ValueError, match="zero at the truth"):
+        conditional_places(target, torch.zeros(DIMENSION, dtype=torch.float64))
+
+
+def test_the_likelihood_is_calibrated_without_a_sampler(tmp_path: Path) -> None:
+    out = tmp_path / "likelihood"
+    config = Calibration(out=out, runs=6, steps=3, quick=True, estimator="likelihood", misfit=5e-4)
+    calibrate(config)
+    results = json.loads((out / "results.json").read_text())
+    assert results["runs"] == 6 and results["failed"] == 0
+    names = [row["parameter"] for row in results["table"]]
+    assert names[-1] == "misfit_sd" and len(names) == len(set(names)) > 5
+    lines = read_lines(out / "runs.jsonl")
+    assert all(0 <= u <= 1 for line in lines for u in line["place"])
+    assert np.std([line["place"] for line in lines]) > 0.1
 
 
 def test_a_cut_off_last_line_is_dropped(tmp_path: Path) -> None:

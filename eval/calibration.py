@@ -101,7 +101,8 @@ def calibrate(config: Calibration) -> None:
     if by_misfit:
         print(format_table(by_misfit))
     print(f"{len(places)} runs, {failed} failed; limits hold 95 % of calibrated estimators")
-    figure = rank_histograms(places, names)
+    where = "given all others" if config.estimator == "likelihood" else "in the posterior"
+    figure = rank_histograms(places, names, where)
     with SummaryWriter(str(folder / "tensorboard")) as writer:
         save_figure(figure, folder / "figures", "ranks", writer)
         writer.add_text("table", "```\n" + format_table(table) + "\n```")
@@ -161,7 +162,9 @@ def coverage_by_misfit(
     return table
 
 
-def rank_histograms(places: Sequence[Sequence[float]], names: Sequence[str]) -> Figure:
+def rank_histograms(
+    places: Sequence[Sequence[float]], names: Sequence[str], where: str = "in the posterior"
+) -> Figure:
     """One histogram for each parameter, with the band that holds 95 % of calibrated counts."""
     import numpy as np
     from scipy.stats import binom
@@ -177,7 +180,7 @@ def rank_histograms(places: Sequence[Sequence[float]], names: Sequence[str]) -> 
         panel.hist(place[:, i], BINS, range=(0.0, 1.0), color=BELIEF, alpha=0.8)
         panel.set_xlim(0, 1)
         title(panel, name.replace("_", " "))
-        panel.set_xlabel("place of the truth in the posterior [–]")
+        panel.set_xlabel(f"place of the truth {where} [–]")
     for panel in axes[len(names) :]:
         panel.remove()
     return figure

@@ -13,7 +13,8 @@ from tpcd.belief.misfit import MisfitField, misfit_rows
 from tpcd.belief.setting import Setting
 from tpcd.contact import ContactScene
 from tpcd.effects.conditions import angle_difference
-from tpcd.simulator import StepSettings, StepStatus, simulate_step
+from tpcd.planar import transform_points
+from tpcd.simulator import ContactMode, StepSettings, StepStatus, simulate_step
 
 
 @dataclass(frozen=True)
@@ -111,12 +112,17 @@ def filter_history(
             if gap is None or again == PASSES - 1:
                 break
             if again == 0:
-                first, explained = gap, found.explained & usable
+                first, explained, density = gap, found.explained, found.log_density
                 known = field.gap(state.mean[:, :count], angle)
-                other = usable & ((known - gap).abs().amax(-1) > FAR)
+                moved = ends - _row(conditions.give, k + 1)
+                touching = _touching(here, transition.mode, merged.poses[:, k + 1], pose, moved)
+                stopped = (usable & ~explained)[:, None] & (touching < known)
+                other = usable & ((known - gap).abs().amax(-1) > FAR) | stopped.any(-1)
+                known = torch.where(stopped, touching, known)
                 gap = torch.where(other[:, None], known, gap)
             else:
-                other = explained & usable & ~found.explained
+                lost = explained & ~found.explained
+                other = usable & (lost | (stopped.any(-1) & ~(found.log_density > density)))
                 gap = torch.where(other[:, None], first, gap)
             if not bool(other.any()):
                 break
@@ -133,6 +139,25 @@ def filter_history(
     if steps:
         found_steps = Steps(*(torch.stack(part, 1) for part in zip(*settled, strict=True)))
     return HistoryLikelihood(total, mean, covariance, whitened, log_scale, steps=found_steps)
+
+
+def _touching(
+    scene: ContactScene, mode: Tensor, read: Tensor, pose: Tensor, moved: Tensor
+) -> Tensor:
+    """The field's gap (m, t) with which terrains that are not touched at a pose would just be
+    touched at the one that was read, if they lie on the side where the object was held back;
+    infinite for all others. The object itself is at a pose and what it is `moved` by."""
+    read = read.expand(len(pose), -1)
+    points = transform_points(read + moved, scene.points_ee)
+    found = []
+    for t, terrain in enumerate(scene.terrains):
+        distance, nearest = terrain.signed_distance(points).min(-1)
+        index = nearest[:, None, None].expand(-1, 1, 2)
+        normal = terrain.normal(points.gather(1, index))[:, 0]
+        held = ((read - pose)[:, :2] * normal).sum(-1) > FAR
+        free = mode[:, t] == int(ContactMode.FREE)
+        found.append(torch.where(held & free, -distance, torch.inf))
+    return torch.stack(found, -1)
 
 
 def _column(scene: ContactScene, row: int) -> ContactScene:

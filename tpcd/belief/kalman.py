@@ -16,7 +16,10 @@ state the posterior of the field (Kalman 1960; Rao-Blackwellised particle filter
 Contact is anything but linear where the field is unknown by millimetres: a terrain taken to be
 there may not be touched where it is. So a transition that moves a gap far is stepped again with
 the terrain where the state after it says, and brought in from there (Bell and Cathey 1993: the
-iterated filter is Gauss and Newton's method), unless it is not explained from there.
+iterated filter is Gauss and Newton's method), unless it is not explained from there. A terrain
+that theta and the field leave untouched has no derivative to say that it is nearer: where the
+object was held back before it, and this is not explained, the transition is stepped again with
+that terrain just touched at the pose that was read, if this is likelier.
 
 A transition far outside of what theta and the field allow (an object wedged between floor
 and wall, a bad reading) has its innovation covariance grown until the innovation lies at the

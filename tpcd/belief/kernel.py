@@ -132,7 +132,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
             copy_state(state.mean, state.covariance, state.mean_before, state.covariance_before)
             for t in range(terrains):
                 state.gap_before[t] = state.gap[t]
-            explained = False
+            explained, stopped, first_term = False, False, 0.0
             for again in range(PASSES):
                 _meet(here, given, i, k + 1)
                 for t in range(terrains):
@@ -148,10 +148,17 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
                     break
                 term = assimilate(state, measured, answer, seen, k, measured.sd[i])
                 if again == 0 and math.isfinite(term):
-                    explained = is_explained(state, measured)
-                    if not expect_gap(state, measured, k) > measured.far:
+                    explained, first_term = is_explained(state, measured), term
+                    far = expect_gap(state, measured, k) > measured.far
+                    stopped = not explained and _stop(
+                        points[i], here, answer, measured, seen, k, ends, state
+                    )
+                    if not far and not stopped:
                         break
-                elif again == 1 and explained and not is_explained(state, measured):
+                elif again == 1 and (
+                    (explained and not is_explained(state, measured))
+                    or (stopped and not term > first_term)
+                ):
                     for t in range(terrains):
                         state.gap[t] = state.gap_before[t]
                 else:
@@ -199,6 +206,33 @@ def _meet(here, given, i, row):
         here.normals[0, t, 0] = given.normals[p, r, t, 0]
         here.normals[0, t, 1] = given.normals[p, r, t, 1]
         here.offsets[0, t], here.friction[0, t] = given.offsets[p, r, t], given.friction[p, r, t]
+
+
+@inner
+@no_type_check
+def _stop(outline, here, answer, measured, seen, k, ends, state):
+    """Let terrains that were not touched, but before which the object was held back, be touched at
+    the pose that was read; whether there are any."""
+    found = False
+    angle = measured.poses[seen, k + 1, 2] + ends - measured.give[seen, k + 1, 2]
+    x = measured.poses[seen, k + 1, 0] - measured.give[seen, k + 1, 0]
+    z = measured.poses[seen, k + 1, 1] - measured.give[seen, k + 1, 1]
+    c, s = math.cos(angle), math.sin(angle)
+    for t in range(answer.modes.shape[1]):
+        u, v = here.normals[0, t, 0], here.normals[0, t, 1]
+        held = u * (measured.poses[seen, k + 1, 0] - answer.poses[k, 0])
+        held += v * (measured.poses[seen, k + 1, 1] - answer.poses[k, 1])
+        if answer.modes[k, t] != 0 or not held > measured.far:
+            continue
+        along, across = u * c + v * s, v * c - u * s
+        nearest = np.inf
+        for p in range(outline.shape[1]):
+            nearest = min(nearest, along * outline[0, p] + across * outline[1, p])
+        nearest += u * x + v * z - here.offsets[0, t] - state.gap_before[t]
+        if nearest > -state.gap[t]:
+            state.gap[t] = -nearest
+            found = True
+    return found
 
 
 @inner

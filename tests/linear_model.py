@@ -69,3 +69,52 @@ class LinearTarget:
         gradient = (data - x @ rows.T) @ rows / NOISE**2 - x
         information = torch.eye(DIMENSION).double() + rows.T @ rows / NOISE**2
         return gradient, information.expand(len(x), -1, -1)
+
+    def coordinates(self, x: Tensor, weights: Tensor) -> Sheared:
+        information = self.curvature(x[:1])[1][0]
+        centre = self.model.posterior(self.count)[0]
+        return Sheared(centre, information)
+
+
+@dataclass(frozen=True)
+class Sheared:
+    """The first entry in deviations from what the others say it is."""
+
+    centre: Tensor
+    information: Tensor
+
+    @property
+    def entries(self) -> list[int]:
+        return [0]
+
+    def _given(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        along = self.information[0, 1:] / self.information[0, 0]
+        mean = self.centre[0] - (x[:, 1:] - self.centre[1:]) @ along
+        return mean, self.information[0, 0].rsqrt()
+
+    def to_score(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        mean, std = self._given(flat)
+        score = torch.cat(((mean + std * flat[:, 0])[:, None], flat[:, 1:]), dim=-1)
+        return score, std.log().expand(len(flat))
+
+    def from_score(self, score: Tensor) -> tuple[Tensor, Tensor]:
+        mean, std = self._given(score)
+        flat = torch.cat((((score[:, 0] - mean) / std)[:, None], score[:, 1:]), dim=-1)
+        return flat, std.log().expand(len(flat))
+
+    def log_marginal(self, flat: Tensor) -> Tensor:
+        return torch.zeros_like(flat[:, 0])
+
+
+class Unchanged:
+    """Coordinates that are the scores themselves."""
+
+    entries: tuple[int, ...] = ()
+
+    def to_score(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        return flat, torch.zeros_like(flat[:, 0])
+
+    from_score = to_score
+
+    def log_marginal(self, flat: Tensor) -> Tensor:
+        return torch.zeros_like(flat[:, 0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,10 +10,11 @@ from linear_model import DIMENSION, LinearModel, LinearTarget
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, start_cloud
-from tpcd.belief.importance import adapt, assimilate, draw_pool, spread_choice
-from tpcd.belief.pool import Proposal, cut_off, truncate, weigh
+from tpcd.belief.importance import assimilate, draw_pool
+from tpcd.belief.pool import Proposal, weigh
 from tpcd.belief.proposals import DAMPINGS, curved_mixture
 from tpcd.belief.settings import SamplerSettings
+from tpcd.belief.weights import cut_off, spread_choice, truncate
 
 SETTINGS = SamplerSettings(particles=2000, draws=6000)
 FEW = SamplerSettings(particles=500, places=20, fresh_modes=20, modes=5)
@@ -265,47 +265,11 @@ def test_evidence_is_not_biased_by_the_places_chosen() -> None:
         {"modes": 0},
         {"fresh_modes": 0},
         {"climbing_rounds": -1},
+        {"flat_rounds": -1},
+        {"flat_starts": 0},
+        {"flat_draws": 10},
     ],
 )
 def test_settings_without_meaning_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         SamplerSettings(**wrong)
-
-
-def test_mixtures_of_two_passes_together_give_the_known_posterior() -> None:
-    model, settings = LinearModel(5, seed=4), replace(FEW, spread=0.3)
-    target, generator = model.target(5), torch.Generator().manual_seed(2)
-    first = adapt(start(), target, 5, settings, generator)
-    cloud = first.pool(target, 1000, generator).cloud(500, generator, settings.spread)
-    both = adapt(cloud, target, 5, settings, generator, first)
-    assert both.peaks is first.peaks and both.evaluations > first.evaluations
-    assert both.proposal.from_prior == 2 * first.proposal.from_prior
-    pool = both.pool(target, 8000, generator)
-    mean, covariance, log_evidence = model.posterior(5)
-    std = covariance.diagonal().sqrt()
-    found = pool.cloud(4000, generator)
-    assert ((found.weights @ found.positions - mean).abs() / std).max() < 0.1
-    deviation = (found.weights @ (found.positions - mean) ** 2).sqrt()
-    torch.testing.assert_close(deviation, std, rtol=0.06, atol=0)
-    assert abs(pool.log_evidence - log_evidence) < 4 * pool.log_evidence_std
-
-
-def test_a_cloud_by_a_power_of_the_likelihood_is_that_of_the_weaker_data() -> None:
-    """The likelihood to the power of a half is that of data with twice the variance."""
-    model, generator = LinearModel(3, seed=8), torch.Generator().manual_seed(0)
-    target = model.target(3)
-    pool = draw_pool(start(), target, 3, replace(SETTINGS, spread=0.5), generator)
-    half = pool.cloud(4000, generator, 0.5)
-    precision = torch.linalg.inv(model.posterior(3)[1])
-    identity = torch.eye(DIMENSION, dtype=torch.float64)
-    expected = torch.linalg.inv(identity + 0.5 * (precision - identity)).diagonal().sqrt()
-    mean = half.weights @ half.positions
-    found = (half.weights @ (half.positions - mean) ** 2).sqrt()
-    torch.testing.assert_close(found, expected, rtol=0.08, atol=0)
-    assert bool((found > model.posterior(3)[1].diagonal().sqrt()).all())
-
-
-@pytest.mark.parametrize("spread", [0.0, 1.1, math.nan])
-def test_a_spread_without_meaning_is_refused(spread: float) -> None:
-    with pytest.raises(ValueError, match="spread is .*, expected above 0 and at most 1"):
-        SamplerSettings(spread=spread)

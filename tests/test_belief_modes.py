@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import pytest
 import torch
+from linear_model import Unchanged
 from torch import Tensor
 
 from tpcd.belief.cloud import CURVATURE_COST, Counted, start_cloud
@@ -47,6 +49,9 @@ class ThreeModes:
         nearest = ((x[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
         gradient = (CENTRES[nearest] - x) / WIDTH**2
         return gradient, torch.eye(DIMENSION).double().expand(len(x), -1, -1) / WIDTH**2
+
+    def coordinates(self, x: Tensor, weights: Tensor) -> Unchanged:
+        return Unchanged()
 
 
 def test_a_climb_gains_at_every_step_and_arrives() -> None:
@@ -125,11 +130,14 @@ def test_each_mode_is_found_once_and_remembered() -> None:
     torch.testing.assert_close(again.points, peaks.points, atol=1e-3, rtol=0)
 
 
-def test_a_cloud_in_one_mode_still_gives_all_modes_their_share_and_the_evidence() -> None:
+@pytest.mark.parametrize("flat_rounds", [0, 4])
+def test_a_cloud_in_one_mode_still_gives_all_modes_their_share_and_the_evidence(
+    flat_rounds: int,
+) -> None:
     target, generator = ThreeModes(), torch.Generator().manual_seed(2)
     normal = torch.randn(400, 2, generator=generator, dtype=torch.float64)
     cloud = start_cloud(CENTRES[0] + WIDTH * normal)
-    settings = SamplerSettings(fresh_modes=60, modes=30, draws=6000)
+    settings = SamplerSettings(fresh_modes=60, modes=30, draws=6000, flat_rounds=flat_rounds)
     pool = draw_pool(cloud, target, 1, settings, generator)
     nearest = ((pool.positions[:, None] - CENTRES) ** 2).sum(-1).argmin(-1)
     weights = pool.log_weights.softmax(0)

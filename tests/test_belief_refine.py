@@ -27,7 +27,9 @@ from tpcd.shape.checkpoint import load_prior
 PRIOR, STEPS = "ycb21-z2", 4
 SETTINGS = EstimatorSettings(
     sampler=SamplerSettings(particles=64, draws=600),
-    closing=SamplerSettings(places=300, draws=3000, modes=60, fresh_modes=200),
+    closing=SamplerSettings(
+        draws=3000, fresh_modes=60, flat_rounds=4, flat_starts=4000, flat_draws=800
+    ),
 )
 
 
@@ -110,17 +112,25 @@ def test_the_mixture_is_adapted_again_while_too_few_draws_count(
 
     one, two, three = (closed(passes, math.inf) for passes in (1, 2, 3))
     spent = [each.info.evaluations for each in (one, two, three)]
-    # The first pass looks for modes besides; the draws between passes are a sixth of the last.
-    again = spent[1] - spent[0], spent[2] - spent[1]
-    assert 500 < again[0] < spent[0] and 0.8 < again[1] / again[0] < 1.25
+    # The first pass looks for modes besides; each has four rounds, the last of which only shapes
+    # the mixture, and draws that count.
+    assert spent[1] - spent[0] == spent[2] - spent[1] == 3 * 800 + 3000 < spent[0]
     assert [each.info.draws for each in (one, two, three)] == [3000] * 3
     rounds = SETTINGS.closing.rounds
-    assert [each.info.rounds for each in (one, two, three)] == [rounds, 2 * rounds, 3 * rounds]
+    assert [each.info.rounds for each in (one, two, three)] == [rounds + 4, rounds + 8, rounds + 12]
     assert not torch.equal(one.belief.vectors, two.belief.vectors)
     # Where the draws after the first pass already count enough, it is the only one.
     enough = closed(3, 1e-9)
-    assert enough.info.evaluations == spent[0] + 500 and enough.info.rounds == rounds
+    assert enough.info.evaluations == spent[0] and enough.info.rounds == rounds + 4
     assert len(enough.belief.vectors) > 1
+
+
+def test_without_rounds_in_flat_coordinates_there_is_one_pass(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep]
+) -> None:
+    plain = replace(SETTINGS, closing=replace(SETTINGS.closing, flat_rounds=0), closing_passes=3)
+    found = refine(episode, estimator.shape, steps[-1].state, plain)
+    assert found.info.rounds == SETTINGS.closing.rounds and found.info.draws == 3000
 
 
 def test_the_middle_of_an_episode_is_refined_from_its_own_data(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -13,6 +14,29 @@ from tpcd.belief.proposals import DAMPINGS
 
 CURVATURE_COST = 3
 """Evaluations that gradient and information cost together."""
+
+
+@runtime_checkable
+class Coordinates(Protocol):
+    """Other coordinates of a posterior, in which it is less bent than in its scores."""
+
+    @property
+    def entries(self) -> Sequence[int]:
+        """Which of them are nearly standard normal, whatever the others are; the others are
+        scores."""
+        ...
+
+    def log_marginal(self, flat: Tensor, /) -> Tensor:
+        """About the log likelihood (m) of the others, but for a constant."""
+        ...
+
+    def to_score(self, flat: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Scores (m, d), and log |d score / d flat| (m); infinite scores have no prior density."""
+        ...
+
+    def from_score(self, score: Tensor, /) -> tuple[Tensor, Tensor]:
+        """The inverse, and log |d score / d flat| (m) again."""
+        ...
 
 
 @runtime_checkable
@@ -39,6 +63,10 @@ class Target(Protocol):
     def curvature(self, positions: Tensor, /) -> tuple[Tensor, Tensor]:
         """Gradient (m, d) and information (m, d, d), positive semi-definite, of the log
         posterior. Only proposals depend on them, so they need not be exact."""
+        ...
+
+    def coordinates(self, positions: Tensor, weights: Tensor, /) -> Coordinates:
+        """Coordinates that suit a posterior which positions (m, d) and weights (m) stand for."""
         ...
 
 
@@ -70,6 +98,11 @@ class Counted:
         """Of the target."""
         self.evaluations += CURVATURE_COST * len(positions)
         return self.target.curvature(positions)
+
+    def coordinates(self, positions: Tensor, weights: Tensor) -> Coordinates:
+        """Of the target."""
+        self.evaluations += len(positions)
+        return self.target.coordinates(positions, weights)
 
 
 @dataclass(frozen=True)

@@ -13,35 +13,29 @@ weight too small. So the trial only shapes the mixture: what counts are new draw
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, Counted, Target
+from tpcd.belief.flat_rounds import adapt_flat, flat_starts
 from tpcd.belief.modes import Climbers, climb, find_modes, set_out
-from tpcd.belief.pool import (
-    Pool,
-    Proposal,
+from tpcd.belief.pool import Pool, Proposal, weigh
+from tpcd.belief.proposals import CurvedMixture, curved_mixture
+from tpcd.belief.settings import SamplerSettings
+from tpcd.belief.weights import (
     cut_off,
     finite,
     known_weights,
-    tempered,
+    spread_choice,
     threshold,
-    weigh,
 )
-from tpcd.belief.proposals import CurvedMixture, curved_mixture
-from tpcd.belief.settings import SamplerSettings
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
 _TRUSTED = 5
 """So many trial draws must have a weight before it decides which draws are hopeless."""
-_FEWEST_PLACES = 300.0
-"""Places are chosen as if no draw had more than this share of the weight (1 / count), so that
-components also go where the draws found little so far."""
-_LARGEST_SHARE = 10.0
-"""Of few draws that have a weight each may have so many times its even share."""
 
 
 def assimilate(
@@ -78,23 +72,22 @@ def adapt(
     datum: int,
     settings: SamplerSettings,
     generator: torch.Generator,
-    earlier: Adapted | None = None,
 ) -> Adapted:
-    """A mixture that starts at the cloud and the modes, and goes to where the weight is.
-
-    With an `earlier` one its modes are taken for known, and its components are kept beside.
-    """
+    """A proposal that starts at the cloud and the modes, and goes to where the weight is."""
     target = Counted(target)
-    if earlier is None:
-        peaks = find_modes(target, cloud.modes, settings, generator)
-    else:
-        peaks = earlier.peaks
+    log_weights = _brought_on(cloud, target)
+    begun = None
+    if settings.flat_rounds:
+        coordinates = target.coordinates(cloud.positions, known_weights(log_weights))
+        begun = flat_starts(target, coordinates, settings, generator)
+    fresh = None if begun is None else begun.points
+    peaks = find_modes(target, cloud.modes, settings, generator, fresh)
     shares = cloud.shares
     counts = _counts(shares, settings.draws_per_place)
     mixture = CurvedMixture.joined(
         [
             curved_mixture(each.points, each.gradient, each.information, counts)
-            for each in (peaks, _follow(cloud, target, settings, generator))
+            for each in (peaks, _follow(cloud, log_weights, target, settings, generator))
         ]
     )
     trial = _of_prior(target, max(1, settings.prior_draws // datum), generator)
@@ -106,18 +99,18 @@ def adapt(
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
         if left == 0:
             break
-        by_place = tempered(log_weights, trial.log_likelihood, settings.spread)
-        centres = trial.positions[spread_choice(by_place, settings.places, generator)]
+        centres = trial.positions[spread_choice(log_weights, settings.places, generator)]
         counts = _counts(shares, settings.draws_per_place)
         mixture = curved_mixture(centres, *target.curvature(centres), counts)
     assert trial.mixture is not None
     proposal = Proposal(trial.mixture, trial.from_prior)
+    if begun is not None:
+        flat = begun.proposal(trial.positions, trial.log_weights)
+        flat = adapt_flat(target, flat, settings, generator)
+        proposal = replace(proposal, flat=flat)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
     best = float(trial.log_weights.topk(min(_TRUSTED, len(trial.positions))).values[-1])
-    if earlier is not None:
-        proposal = earlier.proposal.beside(proposal)
-    spent = target.evaluations + (0 if earlier is None else earlier.evaluations)
-    return Adapted(proposal, best, peaks, shares, spent)
+    return Adapted(proposal, best, peaks, shares, target.evaluations)
 
 
 @dataclass(frozen=True)
@@ -138,6 +131,17 @@ class Adapted:
         drawn = weigh(target, self.proposal, count, self.best, generator)
         spent = self.evaluations + target.evaluations
         return Pool(*drawn, self.peaks.points, self.shares, spent)
+
+    def again(
+        self, target: Target, pool: Pool, settings: SamplerSettings, generator: torch.Generator
+    ) -> Adapted:
+        """With further mixtures in flat coordinates, which begin at the draws of a pool."""
+        assert self.proposal.flat is not None
+        target = Counted(target, pool.evaluations)
+        flat = self.proposal.flat.begun(pool.positions, pool.log_weights)
+        flat = adapt_flat(target, flat, settings, generator)
+        proposal = replace(self.proposal, flat=flat)
+        return replace(self, proposal=proposal, evaluations=target.evaluations)
 
 
 def _counts(shares: Tensor, total: int) -> Tensor:
@@ -200,21 +204,21 @@ def _of_prior(target: Target, count: int, generator: torch.Generator) -> _Draws:
     return _Draws(positions, log_prior, log_likelihood, log_prior + math.log(count), None, count)
 
 
-def _follow(
-    cloud: Cloud, target: Target, settings: SamplerSettings, generator: torch.Generator
-) -> Climbers:
-    """Particles that explain the new datum best, a damped Newton step on."""
+def _brought_on(cloud: Cloud, target: Target) -> Tensor:
+    """Log weights of the particles with the new datum."""
     gain = target.log_likelihood(cloud.positions, None) - cloud.log_likelihood
     log_weights = torch.where(torch.isfinite(gain), gain, -torch.inf) + cloud.weights.log()
-    if not bool(torch.isfinite(log_weights).any()):
-        # Nobody explains it; the places then are those of the history before.
-        log_weights = cloud.weights.log()
+    # Where nobody explains it, those of the history before.
+    return log_weights if bool(torch.isfinite(log_weights).any()) else cloud.weights.log()
+
+
+def _follow(
+    cloud: Cloud,
+    log_weights: Tensor,
+    target: Target,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> Climbers:
+    """Particles that explain the new datum best, a damped Newton step on."""
     places = cloud.positions[spread_choice(log_weights, settings.places, generator)]
     return climb(target, set_out(target, places), 1).surveyed(target)
-
-
-def spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Indices drawn by weight, none of which may take more than a small share."""
-    weights = known_weights(log_weights)
-    weights = cut_off(weights, min(_FEWEST_PLACES, float((weights > 0).sum()) / _LARGEST_SHARE))
-    return torch.multinomial(weights, count, replacement=True, generator=generator)

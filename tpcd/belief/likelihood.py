@@ -52,10 +52,12 @@ def history_likelihood(
     innovations: bool = False,
     added: Added | None = None,
     outcome: Outcome | None = None,
+    steps: bool = False,
 ) -> HistoryLikelihood:
     """Evaluate m particles, each with its own size of the outline misfit, on n transitions.
 
     Effects answer to the `outcome` if one is given: not quite theirs, but at the cost of one pass.
+    With `steps` the answer tells how the transitions settled.
     """
     if least is not None and not innovations:
         hopeless = least == torch.inf
@@ -92,9 +94,9 @@ def history_likelihood(
             least = torch.where(highest > least, least, torch.inf)
     arguments = (scene.points_ee, setting, misfit_sd, field, settings)
     if compiled:
-        found = compiled_filter(*arguments, least, innovations)
+        found = compiled_filter(*arguments, least, innovations, steps)
     else:
-        found = filter_history(*arguments, innovations)
+        found = filter_history(*arguments, innovations, steps)
     if starts is not None:
         further = further + starts.log_free(
             field, misfit_sd, found.field_mean, found.field_covariance

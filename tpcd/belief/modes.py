@@ -70,9 +70,12 @@ def find_modes(
     remembered: Float[Tensor, "k d"],
     settings: SamplerSettings,
     generator: torch.Generator,
+    fresh: Float[Tensor, "f d"] | None = None,
 ) -> Climbers:
-    """The highest distinct modes, with gradient and information."""
-    start = set_out(target, target.scatter(settings.fresh_modes, generator))
+    """The highest distinct modes, with gradient and information; `fresh` points climb besides
+    those from all over the prior."""
+    points = target.scatter(settings.fresh_modes, generator)
+    start = set_out(target, points if fresh is None else torch.cat((points, fresh)))
     start = set_out(target, remembered).beside(climb_with_the_best(target, start, settings))
     arrived = climb(target, start, settings.following_rounds).surveyed(target)
     points, information = arrived.points, arrived.information

@@ -10,46 +10,48 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, Target
+from tpcd.belief.flat_rounds import FlatProposal
 from tpcd.belief.pareto import tail_shape
 from tpcd.belief.proposals import CurvedMixture
-from tpcd.belief.resampling import (
-    effective_sample_size,
-    normalise_log_weights,
-    systematic_resample,
-)
+from tpcd.belief.resampling import effective_sample_size, systematic_resample
+from tpcd.belief.weights import finite, known_weights, threshold, truncate
 
-_HOPELESS = 20.0
-"""A draw whose log weight is so far below the best one counts as impossible."""
+FLAT_SHARE = 0.8
+"""Share of the draws from the mixtures in flat coordinates, where there are any."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """The prior, drawn from so often, beside a mixture."""
+    """The prior, drawn from so often, a mixture that follows the curvature, and mixtures in flat
+    coordinates."""
 
     mixture: CurvedMixture
     from_prior: int
-
-    def beside(self, other: Proposal) -> Proposal:
-        """Both together."""
-        mixture = CurvedMixture.joined([self.mixture, other.mixture])
-        return Proposal(mixture, self.from_prior + other.from_prior)
+    flat: FlatProposal | None = None
 
     def log_density(
         self, positions: Float[Tensor, "n d"], log_prior: Float[Tensor, " n"]
     ) -> Float[Tensor, " n"]:
-        """Log density of prior and mixture together."""
+        """Log density of all of them together."""
         total = float(self.mixture.counts.sum()) + self.from_prior
         prior = log_prior + math.log(self.from_prior)
-        return torch.logaddexp(self.mixture.log_sum(positions), prior) - math.log(total)
+        found = torch.logaddexp(self.mixture.log_sum(positions), prior) - math.log(total)
+        if self.flat is None:
+            return found
+        flat = self.flat.log_density(positions) + math.log(FLAT_SHARE)
+        return torch.logaddexp(found + math.log(1 - FLAT_SHARE), flat)
 
     def draw(
         self, target: Target, count: int, generator: torch.Generator
     ) -> Float[Tensor, "count d"]:
         """So many draws, shared out over prior and components."""
+        in_flat = 0 if self.flat is None else round(count * FLAT_SHARE)
+        flat = [] if self.flat is None else [self.flat.draw(in_flat, generator)]
+        left = count - in_flat
         total = float(self.mixture.counts.sum()) + self.from_prior
-        from_prior = round(count * self.from_prior / total)
+        from_prior = round(left * self.from_prior / total)
         plain = target.sample(from_prior, generator)
-        return torch.cat((plain, self.mixture.draw_some(count - from_prior, generator)))
+        return torch.cat((plain, self.mixture.draw_some(left - from_prior, generator), *flat))
 
 
 @dataclass(frozen=True)
@@ -82,10 +84,9 @@ class Pool:
         spread = 1.0 / self.effective_sample_size - 1.0 / len(self.log_weights)
         return math.sqrt(max(spread, 0.0))
 
-    def cloud(self, particles: int, generator: torch.Generator, power: float = 1.0) -> Cloud:
-        """So many particles drawn by weight, or by weights with a `power` of the likelihood."""
-        log_weights = tempered(self.log_weights, self.log_likelihood, power)
-        weights = truncate(known_weights(log_weights))
+    def cloud(self, particles: int, generator: torch.Generator) -> Cloud:
+        """So many particles drawn by weight."""
+        weights = truncate(known_weights(self.log_weights))
         index, counts = systematic_resample(weights, particles, generator).unique(
             return_counts=True
         )
@@ -131,53 +132,3 @@ def weigh(
         # A single trial draw of a weight beyond all others must not rule all draws out.
         log_likelihood = target.log_likelihood(positions, None)
     return positions, log_likelihood, finite(log_prior + log_likelihood - density)
-
-
-def threshold(best: float, density: Tensor, log_prior: Tensor) -> Tensor:
-    """Log likelihood from which a draw is worth weighing; infinite where the prior is zero."""
-    least = best - _HOPELESS + density - log_prior
-    return torch.where(torch.isfinite(log_prior), least, torch.inf)
-
-
-def tempered(
-    log_weights: Float[Tensor, " n"], log_likelihood: Float[Tensor, " n"], power: float
-) -> Float[Tensor, " n"]:
-    """Log weights with a power of the likelihood in place of the likelihood itself."""
-    return finite(log_weights - (1 - power) * log_likelihood)
-
-
-def finite(log_weights: Tensor) -> Tensor:
-    """Log weights, -inf where there is none."""
-    return torch.where(torch.isfinite(log_weights), log_weights, -torch.inf)
-
-
-def known_weights(log_weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Weights that sum to 1; raises ValueError where all are zero."""
-    if not bool((log_weights > -torch.inf).any()):
-        raise ValueError(
-            "no particle explains the new datum (every likelihood is zero or NaN); "
-            "check units and frames of the data against the priors"
-        )
-    return normalise_log_weights(log_weights)
-
-
-def truncate(weights: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Weights cut to sqrt(n) times their mean, and normalised again: a bias that vanishes with n,
-    against draws in places that the mixture hardly reaches (Ionides 2008)."""
-    kept = weights.clamp_max(weights.mean() * math.sqrt(len(weights)))
-    return kept / kept.sum()
-
-
-def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
-    """Weights of which none is more than 1 / count of their sum, by and large.
-
-    The cut is repeated, since each one lowers the sum. Raises ValueError where no more than
-    `count` of them are above zero: they could only be made equal.
-    """
-    positive = int((weights > 0).sum())
-    if positive <= count:
-        raise ValueError(f"count is {count}, expected less than the {positive} weights above zero")
-    for _ in range(30):
-        weights = weights.clamp_max(1.0 / count)
-        weights = weights / weights.sum()
-    return weights

@@ -2,18 +2,16 @@
 
 After each transition the sampler spends little, which is enough to choose the next move by. What
 is left of an episode is the belief after its last transition, and that one may cost more: with ten
-data the draws of `budget` are worth about six, and their intervals are too narrow.
+data the draws of `budget` are worth about ten, and whole pieces of the posterior are without one.
 
-One mixture is not enough: the sheet on which theta is likely is long and bent, and where components
-are missing no draw gets. So the mixture is adapted in several passes, each of which begins where
-the draws of the one before lie, and all components are kept. Places are chosen further apart than
-the posterior is wide, or its ends get too few (`SamplerSettings.spread`).
+Draws in flat coordinates from all over the prior say where the posterior has its pieces, and
+mixtures there (`flat_rounds`) meet them. Where the draws are worth little all the same, further
+mixtures begin at them.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import torch
 
@@ -25,9 +23,6 @@ from tpcd.belief.settings import EstimatorSettings
 from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
 from tpcd.shape.protocol import Shape
-
-_SHARE_BETWEEN = 6
-"""Between two passes one of so many draws shows where the next one begins."""
 
 
 def refine(
@@ -47,20 +42,16 @@ def refine(
     generator = torch.Generator()
     cloud = cloud_from_tensors(state.restore(generator))
     target = target_of(episode, shape, settings).given(history_of(episode).first(state.index))
-    budget, adapted = settings.closing_budget, None
-    for left in reversed(range(settings.closing_passes)):
-        adapted = adapt(cloud, target, state.index, budget, generator, adapted)
-        if left == 0:
-            break
-        few = adapted.pool(target, max(1, budget.draws // _SHARE_BETWEEN), generator)
-        adapted = replace(adapted, evaluations=few.evaluations)
-        if few.effective_sample_size >= settings.closing_worth / _SHARE_BETWEEN:
-            break
-        cloud = few.cloud(budget.particles, generator, budget.spread)
-    assert adapted is not None
+    budget = settings.closing_budget
+    adapted = adapt(cloud, target, state.index, budget, generator)
     pool = adapted.pool(target, budget.draws, generator)
+    passes, most = 1, settings.closing_passes if budget.flat_rounds else 1
+    while pool.effective_sample_size < settings.closing_worth and passes < most:
+        adapted = adapted.again(target, pool, budget, generator)
+        pool = adapted.pool(target, budget.draws, generator)
+        passes += 1
     cloud = pool.cloud(budget.particles, generator)
-    rounds = (settings.closing_passes - left) * budget.rounds
+    rounds = budget.rounds + passes * budget.flat_rounds
     belief, info = belief_of(cloud, target), pool.info(rounds, len(cloud.weights))
     return EstimationStep(state.index, belief, info, time.perf_counter() - started, state)
 

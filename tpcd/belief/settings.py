@@ -26,6 +26,12 @@ class SamplerSettings:
     """Rounds of importance sampling that shape the mixture."""
     draws: int = 1200
     """Draws from the mixture that the rounds arrived at, which are weighted."""
+    flat_rounds: int = 0
+    """Rounds of mixtures in flat coordinates that follow (`flat_rounds`); 0 for none."""
+    flat_starts: int = 4000
+    """Draws of which those that agree with the readings in contact set out to climb too."""
+    flat_draws: int = 3000
+    """Draws of each of them but the last."""
     prior_draws: int = 1500
     """Draws from the prior at the first datum, falling as 1 / k with datum k."""
     modes: int = 12
@@ -36,9 +42,6 @@ class SamplerSettings:
     """Newton steps before the lower half of those gives up."""
     following_rounds: int = 3
     """Newton steps of the modes that are remembered, and of those that did not give up."""
-    spread: float = 1.0
-    """Power of the likelihood in the weights that places are chosen by: below 1 they lie further
-    apart than the draws that count, so that the mixture does not end before the posterior does."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
@@ -47,6 +50,9 @@ class SamplerSettings:
             "places": 1,
             "draws_per_place": 1,
             "rounds": 1,
+            "flat_rounds": 0,
+            "flat_starts": 1,
+            "flat_draws": 100,
             "draws": 100,
             "prior_draws": 1,
             "modes": 1,
@@ -57,18 +63,17 @@ class SamplerSettings:
         for name, limit in least.items():
             if not getattr(self, name) >= limit:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
-        if not 0 < self.spread <= 1:
-            raise ValueError(f"spread is {self.spread}, expected above 0 and at most 1")
 
 
 CLOSING_SAMPLER = SamplerSettings(
-    places=320,
+    places=100,
     draws_per_place=9,
-    rounds=6,
-    draws=30_000,
-    modes=80,
-    fresh_modes=480,
-    spread=0.3,
+    rounds=2,
+    flat_rounds=8,
+    flat_starts=40_000,
+    draws=20_000,
+    modes=40,
+    fresh_modes=240,
 )
 """Budget of the belief that is left once no more data are to come."""
 
@@ -82,10 +87,10 @@ class EstimatorSettings:
     closing: SamplerSettings = CLOSING_SAMPLER
     """Budget once no more data are to come (see `refine`), for as many particles as the other."""
     closing_passes: int = 2
-    """Times at most that the mixture of the closing draws is adapted, each time from where draws of
-    the one before lie."""
-    closing_worth: float = 1000.0
-    """Effective number of closing draws with which it need not be adapted again."""
+    """Times at most that mixtures in flat coordinates are adapted, each time from where draws of
+    those before lie."""
+    closing_worth: float = 300.0
+    """Effective number of closing draws with which they need not be adapted again."""
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""
     misfit_sd: float | None = None

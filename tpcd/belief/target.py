@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.filtered import HistoryLikelihood
+from tpcd.belief.flattening import Flattening, flattening
 from tpcd.belief.history import History
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.linearised import linearised_likelihood
@@ -17,10 +18,12 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.setting import merge
 from tpcd.effects.conditions import Outcome
-from tpcd.simulator import StepSettings, native
+from tpcd.simulator import ContactMode, StepSettings, native
 
 _LARGE_MISFIT = 2.0
 """Added to the score of the misfit's size."""
+_LEAST_WEIGHT = 1e-3
+"""Of the largest: less does not count for what contact is."""
 _DIFFERENCE = 0.01
 """Step of differences, in standard deviations of the prior."""
 
@@ -133,6 +136,23 @@ class ContactTarget:
         still = torch.zeros_like(slopes[0])
         return _Linearised(whitened, torch.cat(slopes, 1), torch.cat((still, *stretch), 1))
 
+    def coordinates(
+        self, positions: Float[Tensor, "m s"], weights: Float[Tensor, " m"]
+    ) -> Flattening:
+        """Those in which the sheet lies flat, if contact is what most of the weight says it is."""
+        assert self.history is not None
+        # Draws of no weight say nothing, and there can be many.
+        some = weights > _LEAST_WEIGHT * weights.max()
+        steps = self.evaluate(positions[some], steps=True).steps
+        assert steps is not None
+        share = weights[some] / weights[some].sum()
+        modes = (int(ContactMode.FREE), int(ContactMode.STICK))
+        free, stuck = (
+            torch.einsum("m,mnt->nt", share, (steps.mode == mode).double()) for mode in modes
+        )
+        found = flattening(self.prior, self.misfit, self.history, free < 0.5, stuck > 0.5)
+        return found.consistent(positions[some], share)
+
     def parity(self, score: Tensor) -> tuple[Tensor, Tensor]:
         """What pose and wrench of each row say about each other, in standard units, and the
         logarithms of the units; no rows where no effect can change it."""
@@ -152,6 +172,7 @@ class ContactTarget:
         least: Float[Tensor, " m"] | None = None,
         innovations: bool = False,
         outcome: Outcome | None = None,
+        steps: bool = False,
     ) -> HistoryLikelihood:
         """What the particles say about the history; effects answer to the `outcome` if given."""
         assert self.history is not None
@@ -167,6 +188,7 @@ class ContactTarget:
             innovations,
             self.prior.added_of(vectors),
             outcome,
+            steps,
         )
 
 

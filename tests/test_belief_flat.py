@@ -1,0 +1,106 @@
+"""Importance sampling in flat coordinates, against posteriors and densities that are known."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from linear_model import DIMENSION, LinearModel
+from torch import Tensor
+
+from tpcd.belief.cloud import start_cloud
+from tpcd.belief.flat_mixture import WIDTHS, FlatMixture, flat_mixture
+from tpcd.belief.importance import adapt, assimilate
+from tpcd.belief.pool import Pool
+from tpcd.belief.proposals import DEGREES_OF_FREEDOM
+from tpcd.belief.settings import SamplerSettings
+
+SETTINGS = SamplerSettings(particles=4000, draws=8000, flat_rounds=3, flat_draws=1000)
+
+
+def start(count: int = 500) -> Tensor:
+    generator = torch.Generator().manual_seed(2)
+    return torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+
+
+def mixture(broad: tuple[int, ...] = ()) -> FlatMixture:
+    generator = torch.Generator().manual_seed(4)
+    bent = torch.tensor([[1.0, 0, 0], [2.0, 0.5, 0], [-1.0, 0.3, 3.0]], dtype=torch.float64)
+    points = torch.randn(400, 3, generator=generator, dtype=torch.float64) @ bent.T + 1.0
+    weights = torch.rand(400, generator=generator, dtype=torch.float64)
+    shares = torch.arange(1.0, 1 + len(WIDTHS), dtype=torch.float64)
+    return flat_mixture(points, weights / weights.sum(), points[:30], shares, broad)
+
+
+def test_densities_are_those_of_students_around_each_centre() -> None:
+    """Against the formula of the density of each component, with its whole covariance."""
+    nu = DEGREES_OF_FREEDOM
+    for broad in ((), (0,), (2, 0)):
+        found = mixture(broad)
+        b = 3 - len(broad)
+        at = torch.tensor([[0.3, -2.0, 1.0], [5.0, 4.0, -3.0]], dtype=torch.float64)
+        got = found.log_densities(at)
+        for w, width in enumerate(WIDTHS):
+            scale = torch.cat((torch.full((b,), width), torch.ones(3 - b))).double()
+            factor = found.factor * scale
+            kept = math.sqrt(max(0.0, 1 - width**2)) * found.centres
+            centres = torch.cat((kept, kept.new_zeros(len(kept), 3 - b)), -1) @ found.factor.T
+            away = at[:, found.order][:, None] - found.mean - centres
+            unit = torch.linalg.solve_triangular(factor, away[..., None], upper=False)
+            square = unit.square().sum((-2, -1))
+            peak = math.lgamma((nu + 3) / 2) - math.lgamma(nu / 2) - 1.5 * math.log(nu * math.pi)
+            each = peak - factor.diagonal().log().sum() - (nu + 3) / 2 * (square / nu).log1p()
+            expected = torch.logsumexp(each, -1) - math.log(30) + found.shares[w].log()
+            torch.testing.assert_close(got[:, w], expected)
+
+
+def test_draws_come_from_the_density() -> None:
+    """Weighted by another density over its own, draws have the moments of the other one."""
+    found = mixture((1,))
+    draws = found.draw(200_000, torch.Generator().manual_seed(0))
+    log_density = torch.logsumexp(found.log_densities(draws), -1)
+    other = torch.distributions.MultivariateNormal(found.mean, scale_tril=0.7 * found.factor)
+    log_weights = other.log_prob(draws[:, found.order]) - log_density
+    assert abs(float(log_weights.exp().mean()) - 1) < 0.01
+    weights = log_weights.softmax(0)
+    off = (weights @ draws[:, found.order] - found.mean) / found.factor.square().sum(-1).sqrt()
+    assert float(off.abs().max()) < 0.01
+
+
+def known_moments(pool: Pool, model: LinearModel, count: int) -> None:
+    mean, covariance, log_evidence = model.posterior(count)
+    std = covariance.diagonal().sqrt()
+    found = pool.cloud(4000, torch.Generator().manual_seed(7))
+    assert ((found.weights @ found.positions - mean).abs() / std).max() < 0.1
+    deviation = (found.weights @ (found.positions - mean) ** 2).sqrt()
+    torch.testing.assert_close(deviation, std, rtol=0.06, atol=0)
+    assert abs(pool.log_evidence - log_evidence) < 4 * pool.log_evidence_std
+
+
+def test_the_linear_normal_posterior_and_its_evidence_come_out() -> None:
+    model = LinearModel(5, seed=4)
+    target, generator = model.target(5), torch.Generator().manual_seed(3)
+    adapted = adapt(start_cloud(start()), target, 5, SETTINGS, generator)
+    assert adapted.proposal.flat is not None and len(adapted.proposal.flat.mixtures) == 3
+    pool = adapted.pool(target, 8000, generator)
+    known_moments(pool, model, 5)
+    # Again: more mixtures beside those that are there, at the draws of the pool.
+    again = adapted.again(target, pool, SETTINGS, generator)
+    assert again.proposal.flat is not None
+    assert again.proposal.flat.mixtures[:3] == adapted.proposal.flat.mixtures
+    assert len(again.proposal.flat.mixtures) == 6 and again.evaluations > adapted.evaluations
+    second = again.pool(target, 8000, generator)
+    known_moments(second, model, 5)
+    assert second.effective_sample_size > 3000
+
+
+def test_the_same_generator_gives_the_same_draws() -> None:
+    model = LinearModel(3, seed=1)
+    found = [
+        assimilate(
+            start_cloud(start()), model.target(3), 3, SETTINGS, torch.Generator().manual_seed(6)
+        )[0]
+        for _ in range(2)
+    ]
+    assert torch.equal(found[0].positions, found[1].positions)
+    assert found[0].log_evidence == found[1].log_evidence

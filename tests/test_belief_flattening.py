@@ -1,0 +1,150 @@
+"""The map to flat coordinates: an exact change of coordinates, and flat where contact is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from eval.drawn import draw_episode
+from tpcd.belief.belief import target_of
+from tpcd.belief.contact_rows import LINEAR
+from tpcd.belief.flattening import Flattening, flattening
+from tpcd.belief.history import History, history_of
+from tpcd.belief.prior import ParameterPrior, make_prior
+from tpcd.belief.settings import EstimatorSettings
+from tpcd.belief.target import ContactTarget
+from tpcd.shape.checkpoint import load_prior
+
+SETTINGS = EstimatorSettings(misfit_sd=2e-4, misfit_spread=0.0)
+SEEDS = range(70, 90)
+"""Of drawn episodes; nothing was chosen by them."""
+
+
+def drawn(seed: int, steps: int = 6) -> tuple[Tensor, ContactTarget]:
+    """The true score of an episode drawn from the model, and the posterior given it."""
+    shape = load_prior("ycb21-z2")
+    prior, generator = make_prior(shape), torch.Generator().manual_seed(seed)
+    truth, episode = draw_episode(prior, SETTINGS, steps, generator)
+    target = target_of(episode, shape, SETTINGS).given(history_of(episode))
+    return torch.cat((prior.to_score(truth[:-1]), torch.zeros(1)))[None].double(), target
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[tuple[Tensor, ContactTarget]]:
+    return [drawn(seed) for seed in SEEDS]
+
+
+def at_truth(score: Tensor, target: ContactTarget) -> Flattening:
+    return target.coordinates(score, torch.ones(1, dtype=torch.float64))
+
+
+def test_back_and_forth_is_the_same_and_slopes_are_those_of_differences(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    truth, target = episodes[0]
+    found = at_truth(truth, target)
+    generator = torch.Generator().manual_seed(0)
+    score = 0.7 * torch.randn(7, truth.shape[-1], generator=generator, dtype=torch.float64)
+    flat, log_slope = found.from_score(score)
+    back, again = found.to_score(flat)
+    torch.testing.assert_close(back, score, atol=1e-9, rtol=0)
+    torch.testing.assert_close(again, log_slope, atol=1e-9, rtol=0)
+    step = 1e-6 * torch.eye(score.shape[-1], dtype=torch.float64)
+    columns = [
+        (found.from_score(score + row)[0] - found.from_score(score - row)[0]) / 2e-6 for row in step
+    ]
+    jacobian = torch.stack(columns, dim=-1)
+    torch.testing.assert_close(-torch.linalg.slogdet(jacobian)[1], log_slope, atol=1e-5, rtol=0)
+
+
+def test_entries_are_about_standard_normal_at_the_truth(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    """A quarter of standard normal numbers is below 0.32 in size, a half below 0.67 and a tenth
+    above 1.64. The prior's box is taken for a normal, and rolling for a line, so not quite."""
+    sizes = torch.cat(
+        [at_truth(*each).from_score(each[0])[0][:, at_truth(*each).entries] for each in episodes]
+    ).abs()
+    assert 0.5 < float(sizes.median()) < 0.85
+    assert 0.04 < float((sizes > 1.64).double().mean()) < 0.2
+    assert float((sizes > 4).double().mean()) < 0.02
+
+
+def test_the_six_are_pinned_far_below_the_prior(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    """Given the rest, their joint volume is a small part of the prior's."""
+    for truth, target in episodes[:5]:
+        found, none = at_truth(truth, target), untouched(target.prior, target)
+        pinned = found.from_score(truth)[1] - none.from_score(truth)[1]
+        assert float(pinned) < math.log(1e-3)
+
+
+def untouched(prior: ParameterPrior, target: ContactTarget) -> Flattening:
+    assert target.history is not None
+    nothing = torch.zeros(len(target.history), 2, dtype=torch.bool)
+    return flattening(prior, target.misfit, target.history, nothing, nothing)
+
+
+def test_without_contact_the_entries_are_places_in_their_boxes(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    truth, target = episodes[1]
+    found = untouched(target.prior, target)
+    flat, _ = found.from_score(truth)
+    low, high = (edge[found.entries] for edge in (target.prior.low, target.prior.high))
+    value = target.prior.to_vector(truth[:, :-1])[:, found.entries]
+    expected = (value - 0.5 * (low + high)) / (high - low) * math.sqrt(12)
+    torch.testing.assert_close(flat[:, found.entries], expected)
+
+
+def test_what_leaves_its_box_is_infinite_and_has_no_density(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    truth, target = episodes[2]
+    found = at_truth(truth, target)
+    flat, _ = found.from_score(truth)
+    flat = flat.repeat(2, 1)
+    flat[1, found.entries[0]] += 1e4
+    score, _ = found.to_score(flat)
+    assert torch.isfinite(score[0]).all() and torch.isinf(score[1]).any()
+    log_prior = target.log_prior(score)
+    assert float(log_prior[1]) == -math.inf and math.isfinite(float(log_prior[0]))
+    total = target.log_likelihood(score, torch.where(torch.isfinite(log_prior), 0.0, torch.inf))
+    alone = target.log_likelihood(score[:1], torch.zeros(1, dtype=torch.float64))
+    assert float(total[1]) == -math.inf
+    torch.testing.assert_close(total[:1], alone)
+
+
+def test_rows_that_points_contradict_are_left_out(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    """A slide that is taken for rolling says that the floor is elsewhere."""
+    truth, target = next(each for each in episodes if slides_and_turns(each[1].history))
+    history = target.history
+    assert history is not None
+    touched = torch.zeros(len(history), 2, dtype=torch.bool)
+    touched[:, 0] = True
+    wrong = flattening(target.prior, target.misfit, history, touched, touched)
+    one = torch.ones(1, dtype=torch.float64)
+    six = target.prior.to_vector(truth[:, :-1])[:, wrong.entries]
+    off = (six @ wrong.rows.mT - wrong.values)[0].abs()
+    kept = wrong.consistent(truth, one)
+    assert float(off.max()) > 5
+    assert len(kept.rows) == int((off < 3).sum()) < len(wrong.rows)
+
+
+def slides_and_turns(history: History | None) -> bool:
+    assert history is not None
+    turn = (history.settled - history.start)[:, 2].abs() > 0.1
+    moved = (history.settled - history.start)[:, 0].abs() > 0.02
+    return bool((turn & moved)[1:].any())
+
+
+def test_the_linear_entries_are_named_in_the_order_of_theta() -> None:
+    prior = make_prior(load_prior("ycb21-z2"))
+    entries = [prior.names.index(name) for name in LINEAR]
+    assert entries == sorted(entries)

@@ -1,0 +1,209 @@
+"""Adaptive importance sampling in flat coordinates.
+
+Where the data pin some entries given the others (`Coordinates.entries`), draws from all over the
+prior whose entries are standard normal agree with the readings already: a few of them show where
+all of the posterior lies, however many pieces it has. Each round then draws from a mixture around
+the draws that the weights so far choose, and all draws are weighted under the start and the
+mixtures of all rounds (AMIS: Cornuet et al. 2012).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.belief.cloud import Coordinates, Target
+from tpcd.belief.flat_mixture import WIDTHS, FlatMixture, flat_mixture
+from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.settings import SamplerSettings
+from tpcd.belief.weights import finite, known_weights, spread_choice, threshold, truncate
+
+CENTRES = 200
+"""Points that each round puts components at."""
+_LEAST_SHARE = 0.05
+"""Share of the draws that each width keeps at least."""
+_START_POWER = 0.3
+"""Power of what the readings say about the rest, by which starts are chosen: they lie further apart
+than the posterior."""
+_TRUSTED = 5
+"""So many draws must have a weight before it decides which draws are hopeless."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatDraws:
+    """Draws of all rounds, in flat coordinates."""
+
+    flat: Tensor
+    log_target: Tensor
+    """In flat coordinates, not normalised; -inf out of the box."""
+    log_sum: Tensor
+    """Log of the sum of the densities of all draws."""
+
+    @property
+    def log_weights(self) -> Tensor:
+        """But for a constant."""
+        return finite(self.log_target - self.log_sum)
+
+    @property
+    def trusted(self) -> float:
+        """A log weight that some draws reach; -inf where none has any."""
+        if len(self.flat) == 0:
+            return -math.inf
+        return float(self.log_weights.topk(min(_TRUSTED, len(self.flat))).values[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class FlatProposal:
+    """The mixtures of all rounds, drawn from equally often, and where the next one begins."""
+
+    coordinates: Coordinates
+    mixtures: tuple[FlatMixture, ...]
+    flat: Float[Tensor, "m d"]
+    """Draws in flat coordinates,"""
+    log_weights: Float[Tensor, " m"]
+    """and their weights."""
+    shares: Float[Tensor, " w"]
+    """What draws of each width were worth."""
+    starts: FlatDraws
+    """Draws from all over the prior, which count beside those of the rounds."""
+
+    def begun(
+        self, positions: Float[Tensor, "n d"], log_weights: Float[Tensor, " n"]
+    ) -> FlatProposal:
+        """The same, with other draws (scores) where the next mixture begins."""
+        flat, log_weights = _flat_of(self.coordinates, positions, log_weights)
+        return replace(self, flat=flat, log_weights=log_weights)
+
+    def draw(self, count: int, generator: torch.Generator) -> Float[Tensor, "count d"]:
+        """So many draws, as scores; those that leave a box are infinite there."""
+        n = len(self.mixtures)
+        each = [count // n + (k < count % n) for k in range(n)]
+        pairs = zip(self.mixtures, each, strict=True)
+        flat = torch.cat([mixture.draw(often, generator) for mixture, often in pairs])
+        return self.coordinates.to_score(flat)[0]
+
+    def log_density(self, positions: Float[Tensor, "m d"]) -> Float[Tensor, " m"]:
+        """Log density in scores."""
+        flat, log_slope = self.coordinates.from_score(positions)
+        each = torch.cat([mixture.log_densities(flat) for mixture in self.mixtures], -1)
+        return torch.logsumexp(each, -1) - math.log(len(self.mixtures)) - log_slope
+
+
+@dataclass(frozen=True, eq=False)
+class FlatStart:
+    """What is known before the first round."""
+
+    coordinates: Coordinates
+    draws: FlatDraws
+    """From all over the prior, where they agree with the readings in contact."""
+    points: Float[Tensor, "f d"]
+    """Some of them (scores), from which to look for modes."""
+
+    def proposal(
+        self, positions: Float[Tensor, "m d"], log_weights: Float[Tensor, " m"]
+    ) -> FlatProposal:
+        """Still without mixtures, to begin at weighted draws (scores)."""
+        flat, log_weights = _flat_of(self.coordinates, positions, log_weights)
+        shares = flat.new_ones(len(WIDTHS))
+        return FlatProposal(self.coordinates, (), flat, log_weights, shares, self.draws)
+
+
+def flat_starts(
+    target: Target,
+    coordinates: Coordinates,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> FlatStart:
+    """Draws from all over the prior; few where the readings leave the boxes."""
+    flat = target.sample(settings.flat_starts, generator)
+    size = (len(flat), len(coordinates.entries))
+    flat[:, list(coordinates.entries)] = torch.randn(size, generator=generator, dtype=flat.dtype)
+    score, log_slope = coordinates.to_score(flat)
+    log_prior = target.log_prior(score)
+    inside = torch.isfinite(log_prior)
+    flat, score, log_slope, log_prior = (v[inside] for v in (flat, score, log_slope, log_prior))
+    log_density = _log_start(coordinates, flat, score, log_prior)
+    log_target = finite(log_prior + log_slope + target.log_likelihood(score, None))
+    draws = FlatDraws(flat, log_target, log_density + math.log(settings.flat_starts))
+    if len(flat) <= settings.fresh_modes:
+        return FlatStart(coordinates, draws, score)
+    weights = known_weights(_START_POWER * coordinates.log_marginal(flat))
+    chosen = systematic_resample(weights, settings.fresh_modes, generator).unique()
+    return FlatStart(coordinates, draws, score[chosen])
+
+
+def _log_start(coordinates: Coordinates, flat: Tensor, score: Tensor, log_prior: Tensor) -> Tensor:
+    """Log density in flat coordinates of the rest from the prior, and standard normal entries."""
+    own, e = (value[:, list(coordinates.entries)] for value in (score, flat))
+    return log_prior + 0.5 * (own**2 - e**2).sum(-1)
+
+
+def adapt_flat(
+    target: Target,
+    proposal: FlatProposal,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> FlatProposal:
+    """The proposal with the mixtures of so many rounds more."""
+    flat, log_weights, shares = proposal.flat, proposal.log_weights, proposal.shares
+    entries = proposal.coordinates.entries
+    mixtures: tuple[FlatMixture, ...] = ()
+    draws = proposal.starts
+    for left in reversed(range(settings.flat_rounds)):
+        centres = flat[spread_choice(log_weights, CENTRES, generator)]
+        weights = truncate(known_weights(log_weights))
+        mixtures = (*mixtures, flat_mixture(flat, weights, centres, shares, entries))
+        if left == 0:
+            break
+        draws, of_last = _with_a_round(target, proposal, mixtures, draws, settings, generator)
+        flat, log_weights = draws.flat, draws.log_weights
+        worth = truncate(known_weights(log_weights)) @ of_last.softmax(-1).nan_to_num(0.0)
+        shares = worth.clamp_min(_LEAST_SHARE)
+    return replace(
+        proposal,
+        mixtures=(*proposal.mixtures, *mixtures),
+        flat=flat,
+        log_weights=log_weights,
+        shares=shares,
+    )
+
+
+def _flat_of(
+    coordinates: Coordinates, positions: Tensor, log_weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Draws that have a weight."""
+    some = log_weights > -torch.inf
+    return coordinates.from_score(positions[some])[0], log_weights[some]
+
+
+def _with_a_round(
+    target: Target,
+    proposal: FlatProposal,
+    mixtures: tuple[FlatMixture, ...],
+    before: FlatDraws,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> tuple[FlatDraws, Tensor]:
+    """All draws with those from the last of the mixtures, and its log densities at them."""
+    new = mixtures[-1].draw(settings.flat_draws, generator)
+    score, log_slope = proposal.coordinates.to_score(new)
+    log_prior = target.log_prior(score)
+    flat = torch.cat((before.flat, new))
+    of_last = mixtures[-1].log_densities(flat)
+    often, count = math.log(len(new)), len(new)
+    log_sum = torch.logsumexp(of_last, -1) + often
+    here = [mixture.log_densities(new) + often for mixture in mixtures[:-1]]
+    start = _log_start(proposal.coordinates, new, score, log_prior) + math.log(settings.flat_starts)
+    here = torch.cat((*here, finite(start)[:, None], log_sum[-count:, None]), -1)
+    here = torch.logsumexp(here, -1)
+    log_sum = torch.cat((torch.logaddexp(before.log_sum, log_sum[:-count]), here))
+    log_prior = finite(log_prior + log_slope)
+    best, least = before.trusted, None
+    if math.isfinite(best):
+        least = threshold(best, here, log_prior)
+    log_target = finite(log_prior + target.log_likelihood(score, least))
+    return FlatDraws(flat, torch.cat((before.log_target, log_target)), log_sum), of_last

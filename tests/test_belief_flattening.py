@@ -137,6 +137,23 @@ def test_rows_that_points_contradict_are_left_out(
     assert len(kept.rows) == int((off < 3).sum()) < len(wrong.rows)
 
 
+def test_touches_that_points_contradict_are_left_out(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    """No outline touches the wall where it lies on the floor alone."""
+    truth, target = episodes[0]
+    history = target.history
+    assert history is not None
+    nothing = torch.zeros(len(history), 2, dtype=torch.bool)
+    everything = torch.ones(len(history), 2, dtype=torch.bool)
+    wrong = flattening(target.prior, target.misfit, history, everything, nothing)
+    right = at_truth(truth, target)
+    kept = wrong.consistent(truth, torch.ones(1, dtype=torch.float64))
+    assert int((wrong.terrains == 1).sum()) == len(history)
+    assert kept.terrains.tolist() == right.terrains.tolist()
+    torch.testing.assert_close(kept.poses, right.poses)
+
+
 def slides_and_turns(history: History | None) -> bool:
     assert history is not None
     turn = (history.settled - history.start)[:, 2].abs() > 0.1

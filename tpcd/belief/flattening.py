@@ -68,12 +68,24 @@ class Flattening:
     """Right sides of the same."""
 
     def consistent(self, score: Float[Tensor, "m d"], weights: Float[Tensor, " m"]) -> Flattening:
-        """The same without the rows that weighted points contradict: how a step ended does not
-        tell how it went."""
-        six = self.prior.to_vector(score[:, :-1])[:, self.entries]
-        off = weights @ (six @ self.rows.mT - self.values).abs()
-        kept = off < FAR_OFF
-        return replace(self, rows=self.rows[kept], values=self.values[kept])
+        """The same without the touches and rows that weighted points contradict: how a step ended
+        does not tell how it went."""
+        vector = self.prior.to_vector(score[:, :-1])
+        six = vector[:, self.entries]
+        kept = weights @ (six @ self.rows.mT - self.values).abs() < FAR_OFF
+        design, aim = self._touches(vector)
+        off = (design @ six[..., None])[..., 0] - aim
+        sd = self._covariance(self.misfit.sd_of(score[:, -1])).diagonal(dim1=-2, dim2=-1).sqrt()
+        met = weights @ (off / sd).abs() < FAR_OFF
+        return replace(
+            self,
+            rows=self.rows[kept],
+            values=self.values[kept],
+            normals=self.normals[met],
+            terrains=self.terrains[met],
+            poses=self.poses[met],
+            variance=self.variance[met],
+        )
 
     def to_score(
         self, flat: Float[Tensor, "m d"]

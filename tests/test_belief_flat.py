@@ -67,6 +67,15 @@ def test_draws_come_from_the_density() -> None:
     assert float(off.abs().max()) < 0.01
 
 
+def test_points_on_a_line_make_a_mixture_too() -> None:
+    line = torch.linspace(-1e5, 1e5, 3, dtype=torch.float64)[:, None] * torch.ones(1, 4)
+    weights = torch.full((3,), 1 / 3, dtype=torch.float64)
+    shares = torch.ones(len(WIDTHS), dtype=torch.float64)
+    found = flat_mixture(line.double(), weights, line.double(), shares)
+    draws = found.draw(50, torch.Generator().manual_seed(0))
+    assert torch.isfinite(draws).all() and torch.isfinite(found.log_densities(draws)).all()
+
+
 def known_moments(pool: Pool, model: LinearModel, count: int) -> None:
     mean, covariance, log_evidence = model.posterior(count)
     std = covariance.diagonal().sqrt()

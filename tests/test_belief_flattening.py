@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -159,6 +160,28 @@ def slides_and_turns(history: History | None) -> bool:
     turn = (history.settled - history.start)[:, 2].abs() > 0.1
     moved = (history.settled - history.start)[:, 0].abs() > 0.02
     return bool((turn & moved)[1:].any())
+
+
+def test_absurd_points_do_not_disturb_their_neighbours(
+    episodes: list[tuple[Tensor, ContactTarget]],
+) -> None:
+    """A misfit of kilometres, latents far out, entries at the edge of their boxes; all readings at
+    one angle and no grain, so that large misfits are alike in all of them."""
+    truth, target = episodes[3]
+    found = at_truth(truth, target)
+    poses = found.poses.clone()
+    poses[:, 2] = poses[0, 2]
+    bare = replace(found.misfit, grain=0.0, spread=2.0)
+    found = replace(found, poses=poses, misfit=bare)
+    many = truth.repeat(4, 1)
+    many[1, -1], many[2, 0], many[3, found.entries] = 400.0, -60.0, math.inf
+    flat, log_slope = found.from_score(many)
+    alone, slope = found.from_score(truth)
+    torch.testing.assert_close(flat[:1], alone)
+    torch.testing.assert_close(log_slope[:1], slope)
+    assert torch.isfinite(flat).all()
+    back, _ = found.to_score(flat)
+    torch.testing.assert_close(back[:3], many[:3], atol=1e-6, rtol=0)
 
 
 def test_the_linear_entries_are_named_in_the_order_of_theta() -> None:

@@ -24,6 +24,8 @@ from tpcd.belief.resampling import systematic_resample
 WIDTHS = (0.3, 0.6, 1.0, 1.5)
 """Of components, relative to the deviations of the points."""
 _LEAST_VARIANCE = 1e-8
+_LEAST_SHARE = 1e-6
+"""Of its variance that each entry has by itself: few points may lie on a line."""
 _POINTS_AT_ONCE = 100
 
 
@@ -101,8 +103,8 @@ def flat_mixture(
     mean = weights @ flat
     away = flat - mean
     covariance = away.mT @ (away * weights[:, None])
-    least = _LEAST_VARIANCE * torch.eye(len(mean), dtype=mean.dtype)
-    factor = torch.linalg.cholesky(covariance + least)
+    least = _LEAST_VARIANCE + _LEAST_SHARE * covariance.diagonal()
+    factor = torch.linalg.cholesky(covariance + torch.diag(least))
     unit = torch.linalg.solve_triangular(factor, (centres - mean).mT, upper=False).mT
     return FlatMixture(mean, factor, unit[:, : len(narrow)], order, shares / shares.sum())
 

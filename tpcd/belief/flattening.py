@@ -44,6 +44,8 @@ from tpcd.planar import rotate
 
 FAR_OFF = 3.0
 """Mean deviations that points may be off a row."""
+LARGEST_MISFIT = 0.1
+"""The map takes no misfit to be larger [m]: beyond, nothing is left of the readings anyway."""
 _TOUCHES_AT_ONCE = 30_000
 """Points times touches that are held in memory at once, for all points of an outline."""
 
@@ -75,7 +77,7 @@ class Flattening:
         kept = weights @ (six @ self.rows.mT - self.values).abs() < FAR_OFF
         design, aim = self._touches(vector)
         off = (design @ six[..., None])[..., 0] - aim
-        sd = self._covariance(self.misfit.sd_of(score[:, -1])).diagonal(dim1=-2, dim2=-1).sqrt()
+        sd = self._covariance(self._misfit_sd(score)).diagonal(dim1=-2, dim2=-1).sqrt()
         met = weights @ (off / sd).abs() < FAR_OFF
         return replace(
             self,
@@ -144,7 +146,7 @@ class Flattening:
         rest = score.clone()
         rest[:, self.entries] = 0.0
         vector = self.prior.to_vector(rest[:, :-1])
-        sd = self.misfit.sd_of(score[:, -1])
+        sd = self._misfit_sd(score)
         count = len(score)
         # The prior, as if it were normal.
         weight = 12.0 / width**2
@@ -180,6 +182,9 @@ class Flattening:
         fixed = fixed.expand(len(vector), -1, -1)
         aim = -(self.normals * self.poses[:, :2]).sum(-1)
         return torch.cat((support[..., None], fixed), dim=-1), aim
+
+    def _misfit_sd(self, score: Tensor) -> Tensor:
+        return self.misfit.sd_of(score[:, -1]).clamp_max(LARGEST_MISFIT)
 
     def _covariance(self, sd: Tensor) -> Tensor:
         """What touches are off by (m, c, c): their reading, and the outline's misfit [m^2]."""

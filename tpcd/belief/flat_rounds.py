@@ -20,7 +20,14 @@ from tpcd.belief.cloud import Coordinates, Target
 from tpcd.belief.flat_mixture import WIDTHS, FlatMixture, flat_mixture
 from tpcd.belief.resampling import systematic_resample
 from tpcd.belief.settings import SamplerSettings
-from tpcd.belief.weights import finite, known_weights, spread_choice, threshold, truncate
+from tpcd.belief.weights import (
+    TRUSTED,
+    finite,
+    known_weights,
+    spread_choice,
+    threshold,
+    truncate,
+)
 
 CENTRES = 200
 """Points that each round puts components at."""
@@ -29,8 +36,6 @@ _LEAST_SHARE = 0.05
 _START_POWER = 0.3
 """Power of what the readings say about the rest, by which starts are chosen: they lie further apart
 than the posterior."""
-_TRUSTED = 5
-"""So many draws must have a weight before it decides which draws are hopeless."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,7 @@ class FlatDraws:
         """A log weight that some draws reach; -inf where none has any."""
         if len(self.flat) == 0:
             return -math.inf
-        return float(self.log_weights.topk(min(_TRUSTED, len(self.flat))).values[-1])
+        return float(self.log_weights.topk(min(TRUSTED, len(self.flat))).values[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +165,8 @@ def adapt_flat(
         if left == 0:
             break
         draws, of_last = _with_a_round(target, proposal, mixtures, draws, settings, generator)
+        if not bool((draws.log_weights > -torch.inf).any()):
+            continue  # The next one begins where this one did.
         flat, log_weights = draws.flat, draws.log_weights
         worth = truncate(known_weights(log_weights)) @ of_last.softmax(-1).nan_to_num(0.0)
         shares = worth.clamp_min(_LEAST_SHARE)

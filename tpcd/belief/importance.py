@@ -25,6 +25,7 @@ from tpcd.belief.pool import Pool, Proposal, weigh
 from tpcd.belief.proposals import CurvedMixture, curved_mixture
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.weights import (
+    TRUSTED,
     cut_off,
     finite,
     known_weights,
@@ -34,8 +35,6 @@ from tpcd.belief.weights import (
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
-_TRUSTED = 5
-"""So many trial draws must have a weight before it decides which draws are hopeless."""
 
 
 def assimilate(
@@ -109,7 +108,7 @@ def adapt(
         flat = adapt_flat(target, flat, settings, generator)
         proposal = replace(proposal, flat=flat)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
-    best = float(trial.log_weights.topk(min(_TRUSTED, len(trial.positions))).values[-1])
+    best = float(trial.log_weights.topk(min(TRUSTED, len(trial.positions))).values[-1])
     return Adapted(proposal, best, peaks, shares, target.evaluations)
 
 

@@ -12,6 +12,8 @@ from tpcd.belief.resampling import normalise_log_weights
 
 _HOPELESS = 20.0
 """A draw whose log weight is so far below the best one counts as impossible."""
+TRUSTED = 5
+"""So many trial draws must have a weight before it decides which draws are hopeless."""
 _FEWEST_PLACES = 300.0
 """Places are chosen as if no draw had more than this share of the weight (1 / count), so that
 components also go where the draws found little so far."""

@@ -40,8 +40,12 @@ class LinearModel:
         precision = torch.eye(DIMENSION, dtype=torch.float64) + rows.T @ rows / NOISE**2
         covariance = torch.linalg.inv(precision)
         marginal = rows @ rows.T + NOISE**2 * torch.eye(count, dtype=torch.float64)
-        evidence = torch.distributions.MultivariateNormal(torch.zeros_like(data), marginal)
-        return covariance @ rows.T @ data / NOISE**2, covariance, float(evidence.log_prob(data))
+        half = torch.linalg.solve_triangular(
+            torch.linalg.cholesky(marginal), data[:, None], upper=False
+        )
+        scale = torch.linalg.slogdet(2 * math.pi * marginal)[1]
+        log_evidence = float(-0.5 * (half.square().sum() + scale))
+        return covariance @ rows.T @ data / NOISE**2, covariance, log_evidence
 
 
 @dataclass(frozen=True)

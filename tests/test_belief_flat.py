@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import pytest
 import torch
 from linear_model import DIMENSION, LinearModel
 from torch import Tensor
 
 from tpcd.belief.cloud import start_cloud
 from tpcd.belief.flat_mixture import WIDTHS, FlatMixture, flat_mixture
+from tpcd.belief.flat_start import flat_starts
 from tpcd.belief.importance import adapt, assimilate
 from tpcd.belief.pool import Pool
 from tpcd.belief.proposals import DEGREES_OF_FREEDOM
+from tpcd.belief.resampling import effective_sample_size
 from tpcd.belief.settings import SamplerSettings
+from tpcd.simulator import native
 
-SETTINGS = SamplerSettings(particles=4000, draws=8000, flat_rounds=3, flat_draws=1000)
+SETTINGS = SamplerSettings(
+    particles=4000, draws=8000, flat_rounds=3, flat_worth=math.inf, flat_draws=1000
+)
 
 
 def start(count: int = 500) -> Tensor:
@@ -67,6 +74,20 @@ def test_draws_come_from_the_density() -> None:
     assert float(off.abs().max()) < 0.01
 
 
+@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
+@pytest.mark.parametrize("broad", [(), (0,), (2, 0)])
+def test_compiled_loops_and_torch_agree(
+    broad: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Far points included."""
+    found = mixture(broad)
+    points = 3 * torch.randn(300, 3, generator=torch.Generator().manual_seed(1)).double()
+    points[:100] *= 1e4
+    compiled = found.log_densities(points)
+    monkeypatch.setattr(native, "available", lambda: False)
+    torch.testing.assert_close(compiled, found.log_densities(points), rtol=1e-9, atol=1e-9)
+
+
 def test_points_on_a_line_make_a_mixture_too() -> None:
     line = torch.linspace(-1e5, 1e5, 3, dtype=torch.float64)[:, None] * torch.ones(1, 4)
     weights = torch.full((3,), 1 / 3, dtype=torch.float64)
@@ -101,6 +122,36 @@ def test_the_linear_normal_posterior_and_its_evidence_come_out() -> None:
     second = again.pool(target, 8000, generator)
     known_moments(second, model, 5)
     assert second.effective_sample_size > 3000
+
+
+def test_rounds_end_once_their_draws_are_worth_enough() -> None:
+    model = LinearModel(5, seed=4)
+    target = model.target(5)
+    counts = []
+    for worth in (1e-3, 1e6):
+        settings = replace(SETTINGS, flat_rounds=6, flat_worth=worth)
+        adapted = adapt(start_cloud(start()), target, 5, settings, torch.Generator().manual_seed(3))
+        assert adapted.proposal.flat is not None
+        counts.append(len(adapted.proposal.flat.mixtures))
+        known_moments(adapted.pool(target, 8000, torch.Generator().manual_seed(5)), model, 5)
+    assert counts == [2, 6]
+
+
+def test_as_many_starts_are_drawn_as_there_need_be() -> None:
+    """Each start of the linear model is in its boxes, so one lot is enough, or all that may be.
+    Their mean weight is the evidence."""
+    model = LinearModel(5, seed=4)
+    target, log_evidence = model.target(5), model.posterior(5)[2]
+    weights = torch.full((500,), 1 / 500, dtype=torch.float64)
+    coordinates = target.coordinates(start(), weights)
+    for most, needed, expected in ((50_000, 1000, 2000), (50_000, 3000, 4000), (1500, 3000, 1500)):
+        settings = replace(SETTINGS, flat_starts=most, flat_draws=needed)
+        found = flat_starts(target, coordinates, settings, torch.Generator().manual_seed(1))
+        assert found.draws.starts == expected and len(found.draws.flat) == expected
+        own = found.draws.log_weights
+        std = math.sqrt(1 / effective_sample_size(own.softmax(0)) - 1 / expected)
+        assert std < 0.3 and abs(float(torch.logsumexp(own, 0)) - log_evidence) < 4 * std
+        assert 0 < len(found.points) <= settings.fresh_modes
 
 
 def test_the_same_generator_gives_the_same_draws() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -38,9 +39,10 @@ def run(
     return cloud, evidence
 
 
-def test_several_data_one_after_another_give_the_known_posterior() -> None:
+@pytest.mark.parametrize("flat_rounds", [0, 4])
+def test_several_data_one_after_another_give_the_known_posterior(flat_rounds: int) -> None:
     model = LinearModel(6)
-    cloud, _ = run(model, [1, 2, 3, 4, 5, 6], 1, SETTINGS)
+    cloud, _ = run(model, [1, 2, 3, 4, 5, 6], 1, replace(SETTINGS, flat_rounds=flat_rounds))
     mean, covariance, _ = model.posterior(6)
     std = covariance.diagonal().sqrt()
     found_mean = cloud.weights @ cloud.positions
@@ -51,13 +53,14 @@ def test_several_data_one_after_another_give_the_known_posterior() -> None:
     assert (found - torch.eye(DIMENSION, dtype=torch.float64)).abs().max() < 0.15
 
 
-def test_evidence_of_every_stop_lies_within_its_stated_error() -> None:
+@pytest.mark.parametrize("flat_rounds", [0, 4])
+def test_evidence_of_every_stop_lies_within_its_stated_error(flat_rounds: int) -> None:
     """Ten runs of four data, 40 z-scores: of honest errors at most 3 lie beyond 2.6 sd
     (probability of more: 1e-4), and their root mean square is below 1.5."""
     model = LinearModel(4, seed=3)
     scores = []
     for seed in range(10):
-        _, evidence = run(model, [1, 2, 3, 4], seed, FEW)
+        _, evidence = run(model, [1, 2, 3, 4], seed, replace(FEW, flat_rounds=flat_rounds))
         for count, (value, error) in enumerate(evidence, start=1):
             assert error > 0
             scores.append((value - model.posterior(count)[2]) / error)

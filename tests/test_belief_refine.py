@@ -28,7 +28,12 @@ PRIOR, STEPS = "ycb21-z2", 4
 SETTINGS = EstimatorSettings(
     sampler=SamplerSettings(particles=64, draws=600),
     closing=SamplerSettings(
-        draws=3000, fresh_modes=60, flat_rounds=4, flat_starts=4000, flat_draws=800
+        draws=3000,
+        fresh_modes=60,
+        flat_rounds=4,
+        flat_worth=math.inf,
+        flat_starts=4000,
+        flat_draws=800,
     ),
 )
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tpcd.belief.proposals import DEGREES_OF_FREEDOM
 from tpcd.belief.resampling import systematic_resample
+from tpcd.simulator import native
 
 WIDTHS = (0.3, 0.6, 1.0, 1.5)
 """Of components, relative to the deviations of the points."""
@@ -68,24 +69,39 @@ class FlatMixture:
         peak = peak - float(self.factor.diagonal().log().sum()) - math.log(len(self.centres))
         away = (flat[:, self.order] - self.mean).mT
         unit = torch.linalg.solve_triangular(self.factor, away, upper=False).mT
-        parts = [self._sums(part) for part in unit.split(_POINTS_AT_ONCE)]
+        if native.available() and flat.device.type == "cpu":
+            total = self._compiled(unit)
+        else:
+            total = torch.cat([self._sums(part) for part in unit.split(_POINTS_AT_ONCE)])
         width = self.mean.new_tensor(WIDTHS)
         b = self.centres.shape[-1]
-        return torch.cat(parts).log() - b * width.log() + peak + self.shares.log()
+        return total.log() - b * width.log() + peak + self.shares.log()
 
     def _sums(self, unit: Tensor) -> Tensor:
         """Sums (m, w) over the centres of densities without their peaks."""
         d, nu, b = len(self.mean), DEGREES_OF_FREEDOM, self.centres.shape[-1]
         narrow, rest = unit[:, :b], unit[:, b:].square().sum(-1, keepdim=True)
-        product = narrow @ self.centres.mT
-        own, of_centres = narrow.square().sum(-1, keepdim=True), self.centres.square().sum(-1)
         found = []
-        for width in WIDTHS:
-            kept = float(_kept(self.mean.new_tensor(width)))
-            square = (own - 2 * kept * product + kept**2 * of_centres).clamp_min_(0.0)
-            square = square / (nu * width**2) + (1 + rest / nu)
-            found.append(_power(square.rsqrt_(), nu + d).sum(-1))
+        for width in unit.new_tensor(WIDTHS):
+            square = torch.cdist(narrow, _kept(width) * self.centres).square() / width**2
+            found.append(((1 + (square + rest) / nu) ** (-(nu + d) / 2)).sum(-1))
         return torch.stack(found, -1)
+
+    def _compiled(self, unit: Tensor) -> Tensor:
+        from tpcd.belief.mixture_kernel import FlatComponents, flat_sum_range
+
+        width = unit.new_tensor(WIDTHS)
+        parts = (self.centres.mT, width, _kept(width))
+        components = FlatComponents(*(part.contiguous().numpy() for part in parts))
+        total = unit.new_empty(len(unit), len(WIDTHS))
+        given, found = unit.contiguous().numpy(), total.numpy()
+        native.in_parts(
+            lambda first, last: flat_sum_range(
+                given, components, DEGREES_OF_FREEDOM, found, first, last
+            ),
+            len(unit),
+        )
+        return total
 
 
 def flat_mixture(
@@ -107,19 +123,6 @@ def flat_mixture(
     factor = torch.linalg.cholesky(covariance + torch.diag(least))
     unit = torch.linalg.solve_triangular(factor, (centres - mean).mT, upper=False).mT
     return FlatMixture(mean, factor, unit[:, : len(narrow)], order, shares / shares.sum())
-
-
-def _power(base: Tensor, exponent: int) -> Tensor:
-    """A whole power by repeated squares, which takes a fifth of the time of `pow`."""
-    found = None
-    while exponent:
-        if exponent % 2:
-            found = base if found is None else found * base
-        exponent //= 2
-        if exponent:
-            base = base * base
-    assert found is not None
-    return found
 
 
 def _kept(width: Tensor) -> Tensor:

@@ -1,10 +1,9 @@
 """Adaptive importance sampling in flat coordinates.
 
-Where the data pin some entries given the others (`Coordinates.entries`), draws from all over the
-prior whose entries are standard normal agree with the readings already: a few of them show where
-all of the posterior lies, however many pieces it has. Each round then draws from a mixture around
-the draws that the weights so far choose, and all draws are weighted under the start and the
-mixtures of all rounds (AMIS: Cornuet et al. 2012).
+Each round draws from a mixture around the draws that the weights so far choose, and all draws are
+weighted under the start (`flat_start`) and the mixtures of all rounds (AMIS: Cornuet et al. 2012).
+Mean and covariance of a mixture are those of many draws, however few have the weight (nonlinear
+importance sampling: Koblents and Miguez 2015).
 """
 
 from __future__ import annotations
@@ -18,10 +17,11 @@ from torch import Tensor
 
 from tpcd.belief.cloud import Coordinates, Target
 from tpcd.belief.flat_mixture import WIDTHS, FlatMixture, flat_mixture
-from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.flat_start import FlatDraws, FlatStart, log_start
+from tpcd.belief.resampling import effective_sample_size
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.weights import (
-    TRUSTED,
+    evened,
     finite,
     known_weights,
     spread_choice,
@@ -33,32 +33,6 @@ CENTRES = 200
 """Points that each round puts components at."""
 _LEAST_SHARE = 0.05
 """Share of the draws that each width keeps at least."""
-_START_POWER = 0.3
-"""Power of what the readings say about the rest, by which starts are chosen: they lie further apart
-than the posterior."""
-
-
-@dataclass(frozen=True, eq=False)
-class FlatDraws:
-    """Draws of all rounds, in flat coordinates."""
-
-    flat: Tensor
-    log_target: Tensor
-    """In flat coordinates, not normalised; -inf out of the box."""
-    log_sum: Tensor
-    """Log of the sum of the densities of all draws."""
-
-    @property
-    def log_weights(self) -> Tensor:
-        """But for a constant."""
-        return finite(self.log_target - self.log_sum)
-
-    @property
-    def trusted(self) -> float:
-        """A log weight that some draws reach; -inf where none has any."""
-        if len(self.flat) == 0:
-            return -math.inf
-        return float(self.log_weights.topk(min(TRUSTED, len(self.flat))).values[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,53 +72,13 @@ class FlatProposal:
         return torch.logsumexp(each, -1) - math.log(len(self.mixtures)) - log_slope
 
 
-@dataclass(frozen=True, eq=False)
-class FlatStart:
-    """What is known before the first round."""
-
-    coordinates: Coordinates
-    draws: FlatDraws
-    """From all over the prior, where they agree with the readings in contact."""
-    points: Float[Tensor, "f d"]
-    """Some of them (scores), from which to look for modes."""
-
-    def proposal(
-        self, positions: Float[Tensor, "m d"], log_weights: Float[Tensor, " m"]
-    ) -> FlatProposal:
-        """Still without mixtures, to begin at weighted draws (scores)."""
-        flat, log_weights = _flat_of(self.coordinates, positions, log_weights)
-        shares = flat.new_ones(len(WIDTHS))
-        return FlatProposal(self.coordinates, (), flat, log_weights, shares, self.draws)
-
-
-def flat_starts(
-    target: Target,
-    coordinates: Coordinates,
-    settings: SamplerSettings,
-    generator: torch.Generator,
-) -> FlatStart:
-    """Draws from all over the prior; few where the readings leave the boxes."""
-    flat = target.sample(settings.flat_starts, generator)
-    size = (len(flat), len(coordinates.entries))
-    flat[:, list(coordinates.entries)] = torch.randn(size, generator=generator, dtype=flat.dtype)
-    score, log_slope = coordinates.to_score(flat)
-    log_prior = target.log_prior(score)
-    inside = torch.isfinite(log_prior)
-    flat, score, log_slope, log_prior = (v[inside] for v in (flat, score, log_slope, log_prior))
-    log_density = _log_start(coordinates, flat, score, log_prior)
-    log_target = finite(log_prior + log_slope + target.log_likelihood(score, None))
-    draws = FlatDraws(flat, log_target, log_density + math.log(settings.flat_starts))
-    if len(flat) <= settings.fresh_modes:
-        return FlatStart(coordinates, draws, score)
-    weights = known_weights(_START_POWER * coordinates.log_marginal(flat))
-    chosen = systematic_resample(weights, settings.fresh_modes, generator).unique()
-    return FlatStart(coordinates, draws, score[chosen])
-
-
-def _log_start(coordinates: Coordinates, flat: Tensor, score: Tensor, log_prior: Tensor) -> Tensor:
-    """Log density in flat coordinates of the rest from the prior, and standard normal entries."""
-    own, e = (value[:, list(coordinates.entries)] for value in (score, flat))
-    return log_prior + 0.5 * (own**2 - e**2).sum(-1)
+def begin(
+    start: FlatStart, positions: Float[Tensor, "m d"], log_weights: Float[Tensor, " m"]
+) -> FlatProposal:
+    """A proposal still without mixtures, whose first one begins at weighted draws (scores)."""
+    flat, log_weights = _flat_of(start.coordinates, positions, log_weights)
+    shares = flat.new_ones(len(WIDTHS))
+    return FlatProposal(start.coordinates, (), flat, log_weights, shares, start.draws)
 
 
 def adapt_flat(
@@ -158,17 +92,20 @@ def adapt_flat(
     entries = proposal.coordinates.entries
     mixtures: tuple[FlatMixture, ...] = ()
     draws = proposal.starts
-    for left in reversed(range(settings.flat_rounds)):
+    enough = False
+    for k in range(settings.flat_rounds):
         centres = flat[spread_choice(log_weights, CENTRES, generator)]
-        weights = truncate(known_weights(log_weights))
+        weights = evened(log_weights, math.sqrt(len(log_weights)))
         mixtures = (*mixtures, flat_mixture(flat, weights, centres, shares, entries))
-        if left == 0:
+        if enough or k + 1 == settings.flat_rounds:
             break
         draws, of_last = _with_a_round(target, proposal, mixtures, draws, settings, generator)
         if not bool((draws.log_weights > -torch.inf).any()):
             continue  # The next one begins where this one did.
         flat, log_weights = draws.flat, draws.log_weights
-        worth = truncate(known_weights(log_weights)) @ of_last.softmax(-1).nan_to_num(0.0)
+        weights = known_weights(log_weights)
+        enough = effective_sample_size(weights) > settings.flat_worth
+        worth = truncate(weights) @ of_last.softmax(-1).nan_to_num(0.0)
         shares = worth.clamp_min(_LEAST_SHARE)
     return replace(
         proposal,
@@ -204,7 +141,7 @@ def _with_a_round(
     often, count = math.log(len(new)), len(new)
     log_sum = torch.logsumexp(of_last, -1) + often
     here = [mixture.log_densities(new) + often for mixture in mixtures[:-1]]
-    start = _log_start(proposal.coordinates, new, score, log_prior) + math.log(settings.flat_starts)
+    start = log_start(proposal.coordinates, new, score, log_prior) + math.log(before.starts)
     here = torch.cat((*here, finite(start)[:, None], log_sum[-count:, None]), -1)
     here = torch.logsumexp(here, -1)
     log_sum = torch.cat((torch.logaddexp(before.log_sum, log_sum[:-count]), here))
@@ -213,4 +150,5 @@ def _with_a_round(
     if math.isfinite(best):
         least = threshold(best, here, log_prior)
     log_target = finite(log_prior + target.log_likelihood(score, least))
-    return FlatDraws(flat, torch.cat((before.log_target, log_target)), log_sum), of_last
+    log_target = torch.cat((before.log_target, log_target))
+    return FlatDraws(flat, log_target, log_sum, before.starts), of_last

@@ -41,6 +41,7 @@ from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.planar import rotate
+from tpcd.simulator import native
 
 FAR_OFF = 3.0
 """Mean deviations that points may be off a row."""
@@ -77,7 +78,8 @@ class Flattening:
         kept = weights @ (six @ self.rows.mT - self.values).abs() < FAR_OFF
         design, aim = self._touches(vector)
         off = (design @ six[..., None])[..., 0] - aim
-        sd = self._covariance(self._misfit_sd(score)).diagonal(dim1=-2, dim2=-1).sqrt()
+        of_outline = self._misfit_sd(score)[:, None] ** 2 * (1 + self.misfit.grain**2)
+        sd = (self.variance + of_outline).sqrt()
         met = weights @ (off / sd).abs() < FAR_OFF
         return replace(
             self,
@@ -137,7 +139,7 @@ class Flattening:
         """Mean (m, 6) of the six given the rest, the Cholesky factor of their precision, and the
         log likelihood of the rest."""
         at_once = max(1, _TOUCHES_AT_ONCE // max(1, len(self.poses)))
-        parts = [self._conditional_part(part) for part in score.split(at_once)]
+        parts = native.over_threads(self._conditional_part, score, at_once)
         mean, factor, marginal = (torch.cat(column) for column in zip(*parts, strict=True))
         return mean, factor, marginal
 
@@ -155,13 +157,13 @@ class Flattening:
         marginal = torch.zeros_like(sd)
         if len(self.poses):
             design, aim = self._touches(vector)
-            factor = torch.linalg.cholesky(self._covariance(sd))
-            design = torch.linalg.solve_triangular(factor, design, upper=False)
-            aim = aim[:, None].expand(count, -1, 1)
-            aim = torch.linalg.solve_triangular(factor, aim, upper=False)
+            whiten, spread = self._misfit_axes
+            scale = (1 + sd[:, None] ** 2 * spread).rsqrt()
+            design = scale[..., None] * (whiten @ design)
+            aim = scale * (whiten @ aim)
             precision = precision + design.mT @ design
-            pull = pull + (design.mT @ aim)[..., 0]
-            marginal = -0.5 * aim.square().sum((-2, -1)) - _log_diagonal(factor)
+            pull = pull + (design.mT @ aim[..., None])[..., 0]
+            marginal = scale.log().sum(-1) - 0.5 * aim.square().sum(-1)
         precision = precision + self.rows.mT @ self.rows
         pull = pull + self.values @ self.rows
         factor = torch.linalg.cholesky(precision)
@@ -186,13 +188,16 @@ class Flattening:
     def _misfit_sd(self, score: Tensor) -> Tensor:
         return self.misfit.sd_of(score[:, -1]).clamp_max(LARGEST_MISFIT)
 
-    def _covariance(self, sd: Tensor) -> Tensor:
-        """What touches are off by (m, c, c): their reading, and the outline's misfit [m^2]."""
-        angle = self.poses[:, 2]
+    @property
+    def _misfit_axes(self) -> tuple[Tensor, Tensor]:
+        """A matrix W (c, c) and numbers v (c), with which W times what touches are off by has the
+        covariance 1 + sd^2 diag(v): what a reading is off by and what the outline is."""
+        angle, unit = self.poses[:, 2], self.variance.rsqrt()
         near = torch.exp(-((angle[:, None] - angle) ** 2) / (4 * self.misfit.width**2))
         near = near * (self.terrains[:, None] == self.terrains)
         near = near + self.misfit.grain**2 * torch.eye(len(angle), dtype=near.dtype)
-        return sd[:, None, None] ** 2 * near + torch.diag(self.variance)
+        values, axes = torch.linalg.eigh(unit[:, None] * near * unit)
+        return axes.mT * unit, values.clamp_min(0.0)
 
 
 def _log_diagonal(factor: Tensor) -> Tensor:

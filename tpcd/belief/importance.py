@@ -19,14 +19,15 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, CloudInfo, Counted, Target
-from tpcd.belief.flat_rounds import adapt_flat, flat_starts
+from tpcd.belief.flat_rounds import adapt_flat, begin
+from tpcd.belief.flat_start import flat_starts
 from tpcd.belief.modes import Climbers, climb, find_modes, set_out
 from tpcd.belief.pool import Pool, Proposal, weigh
 from tpcd.belief.proposals import CurvedMixture, curved_mixture
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.weights import (
     TRUSTED,
-    cut_off,
+    evened,
     finite,
     known_weights,
     spread_choice,
@@ -74,10 +75,10 @@ def adapt(
 ) -> Adapted:
     """A proposal that starts at the cloud and the modes, and goes to where the weight is."""
     target = Counted(target)
-    log_weights = _brought_on(cloud, target)
+    brought_on = known_weights(_brought_on(cloud, target))
     begun = None
     if settings.flat_rounds:
-        coordinates = target.coordinates(cloud.positions, known_weights(log_weights))
+        coordinates = target.coordinates(cloud.positions, brought_on)
         begun = flat_starts(target, coordinates, settings, generator)
     fresh = None if begun is None else begun.points
     peaks = find_modes(target, cloud.modes, settings, generator, fresh)
@@ -86,14 +87,14 @@ def adapt(
     mixture = CurvedMixture.joined(
         [
             curved_mixture(each.points, each.gradient, each.information, counts)
-            for each in (peaks, _follow(cloud, log_weights, target, settings, generator))
+            for each in (peaks, _follow(cloud, brought_on.log(), target, settings, generator))
         ]
     )
     trial = _of_prior(target, max(1, settings.prior_draws // datum), generator)
     for left in reversed(range(settings.rounds)):
         trial, by_damping = trial.add(target, mixture, generator)
         log_weights = trial.log_weights
-        weights = cut_off(known_weights(log_weights), math.sqrt(len(log_weights)))
+        weights = evened(log_weights, math.sqrt(len(log_weights)))
         worth = weights @ by_damping.softmax(-1).nan_to_num(0.0)
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
         if left == 0:
@@ -104,7 +105,8 @@ def adapt(
     assert trial.mixture is not None
     proposal = Proposal(trial.mixture, trial.from_prior)
     if begun is not None:
-        flat = begun.proposal(trial.positions, trial.log_weights)
+        places = torch.cat((trial.positions, cloud.positions))
+        flat = begin(begun, places, torch.cat((weights, brought_on)).log())
         flat = adapt_flat(target, flat, settings, generator)
         proposal = replace(proposal, flat=flat)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.

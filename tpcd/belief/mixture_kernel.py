@@ -1,4 +1,5 @@
-"""Sum of Student densities in compiled loops; see `proposals`. Imported only where numba is."""
+"""Sums of Student densities in compiled loops; see `proposals` and `flat_mixture`. Imported only
+where numba is."""
 
 from __future__ import annotations
 
@@ -73,3 +74,56 @@ def _compile_sum_range(stamp: int) -> Callable[..., None]:
 sum_range = _compile_sum_range(source_stamp(sys.modules[__name__]))
 """Fill `total` (m, t) of points (m, d) `first` up to `last` with the sum of the densities over all
 places, up to a factor: (points, components, freedom, total, first, last)."""
+
+
+class FlatComponents(NamedTuple):
+    """Components of w widths at each of k centres in standard units: b coordinates (b, k) of the
+    centres, the `width` (w), and the share (w) of their distance that centres keep."""
+
+    centres: np.ndarray
+    width: np.ndarray
+    kept: np.ndarray
+
+
+def _compile_flat_sum_range(stamp: int) -> Callable[..., None]:
+    """The entry, the only function kept in numba's cache; `stamp` makes part of its key."""
+
+    @njit(
+        cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}
+    )
+    @no_type_check
+    def flat_sum_range(points, components, freedom, total, first, last):
+        narrow, count = components.centres.shape
+        dimension = points.shape[1]
+        power = freedom + dimension if stamp >= 0 else 0
+        square, value = np.empty(count), np.empty(count)
+        for i in range(first, last):
+            rest = 0.0
+            for b in range(narrow, dimension):
+                rest += points[i, b] * points[i, b]
+            for w in range(len(components.width)):
+                square[:] = 0.0
+                for b in range(narrow):
+                    coordinate, kept = points[i, b], components.kept[w]
+                    for k in range(count):
+                        away = coordinate - kept * components.centres[b, k]
+                        square[k] += away * away
+                sharpness = 1.0 / (freedom * components.width[w] ** 2)
+                for k in range(count):
+                    square[k] = 1.0 / (1.0 + rest / freedom + square[k] * sharpness)
+                for k in range(count):
+                    value[k] = math.sqrt(square[k]) if power % 2 else 1.0
+                for _ in range(power // 2):
+                    for k in range(count):
+                        value[k] *= square[k]
+                whole = 0.0
+                for k in range(count):
+                    whole += value[k]
+                total[i, w] = whole
+
+    return flat_sum_range
+
+
+flat_sum_range = _compile_flat_sum_range(source_stamp(sys.modules[__name__]))
+"""Fill `total` (m, w) of points (m, d) `first` up to `last` with the sum of the densities over all
+centres, up to a factor: (points, components, freedom, total, first, last)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from tpcd.effects.protocol import Effect
@@ -10,33 +11,32 @@ from tpcd.simulator import StepSettings
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """Budget of the sampler for one datum; by default what choosing the next move needs.
-
-    Places and draws were 70 and 1500; a step takes a tenth less CPU time without a fifth of them,
-    and the closing draws are as many as before.
-    """
+    """Budget of the sampler for one datum; by default what choosing the next move needs."""
 
     particles: int = 700
     """Particles kept of all draws."""
-    places: int = 60
-    """Places that each round of importance sampling puts components at."""
+    places: int = 30
+    """Places that each round of importance sampling puts components at, besides the modes."""
     draws_per_place: int = 5
     """Draws at each place."""
-    rounds: int = 3
+    rounds: int = 2
     """Rounds of importance sampling that shape the mixture."""
-    draws: int = 1200
+    draws: int = 1000
     """Draws from the mixture that the rounds arrived at, which are weighted."""
-    flat_rounds: int = 0
-    """Rounds of mixtures in flat coordinates that follow (`flat_rounds`); 0 for none."""
-    flat_starts: int = 4000
-    """Draws of which those that agree with the readings in contact set out to climb too."""
-    flat_draws: int = 3000
-    """Draws of each of them but the last."""
-    prior_draws: int = 1500
+    flat_rounds: int = 4
+    """Rounds at most of mixtures in flat coordinates that follow (`flat_rounds`); 0 for none."""
+    flat_worth: float = 50.0
+    """Effective number of draws of the rounds so far with which the next one is the last."""
+    flat_starts: int = 3000
+    """Draws at most from all over the prior, of which some that agree with the readings in contact
+    set out to climb too; once `flat_draws` of them agree there are enough."""
+    flat_draws: int = 300
+    """Draws of each of those rounds but the last."""
+    prior_draws: int = 200
     """Draws from the prior at the first datum, falling as 1 / k with datum k."""
-    modes: int = 12
+    modes: int = 8
     """Modes that are remembered from datum to datum."""
-    fresh_modes: int = 30
+    fresh_modes: int = 8
     """Points that set out to climb to a mode at each datum."""
     climbing_rounds: int = 2
     """Newton steps before the lower half of those gives up."""
@@ -51,6 +51,7 @@ class SamplerSettings:
             "draws_per_place": 1,
             "rounds": 1,
             "flat_rounds": 0,
+            "flat_worth": 0,
             "flat_starts": 1,
             "flat_draws": 100,
             "draws": 100,
@@ -69,9 +70,12 @@ CLOSING_SAMPLER = SamplerSettings(
     places=100,
     draws_per_place=9,
     rounds=2,
-    flat_rounds=8,
-    flat_starts=40_000,
     draws=20_000,
+    flat_rounds=8,
+    flat_worth=math.inf,
+    flat_starts=40_000,
+    flat_draws=3000,
+    prior_draws=1500,
     modes=40,
     fresh_modes=240,
 )

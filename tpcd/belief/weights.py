@@ -64,8 +64,14 @@ def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
     return weights
 
 
+def evened(log_weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
+    """Weights that sum to 1, of which none is more than 1 / count, or than ten times its even share
+    where few have any. Raises ValueError where all are zero."""
+    weights = known_weights(log_weights)
+    return cut_off(weights, min(count, float((weights > 0).sum()) / _LARGEST_SHARE))
+
+
 def spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices drawn by weight, none of which may take more than a small share."""
-    weights = known_weights(log_weights)
-    weights = cut_off(weights, min(_FEWEST_PLACES, float((weights > 0).sum()) / _LARGEST_SHARE))
+    weights = evened(log_weights, _FEWEST_PLACES)
     return torch.multinomial(weights, count, replacement=True, generator=generator)

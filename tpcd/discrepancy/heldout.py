@@ -33,11 +33,12 @@ FOLD_SAMPLER = SamplerSettings(
     particles=200,
     places=80,
     draws_per_place=9,
-    draws=1000,
-    prior_draws=100,
-    fresh_modes=24,
     rounds=2,
+    draws=1000,
+    flat_rounds=0,
+    prior_draws=100,
     modes=12,
+    fresh_modes=24,
 )
 """Budget of a fit that starts where the fit of all data arrived."""
 UNITS = ("m", "m", "rad", "N", "N", "N·m")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -81,16 +81,29 @@ def outlines(shape: Shape, parameters: Parameters) -> Float[Tensor, "m p 2"]:
 
 def decode(shape: Shape, latent: Float[Tensor, "m z"]) -> Float[Tensor, "m p 2"]:
     """Outline points of m latents in the object frame [m], in the same threads, no gradient."""
-    threads = min(thread_count(), math.ceil(len(latent) / CHUNK))
+    return torch.cat(over_threads(shape.boundary_points, latent))
 
-    def part(own: Tensor) -> Tensor:
+
+Answer = TypeVar("Answer")
+
+
+def over_threads(
+    work: Callable[[Tensor], Answer], rows: Tensor, most: int | None = None
+) -> list[Answer]:
+    """What `work` answers to parts of some rows on the CPU, of so many rows at `most`, in order,
+    in as many threads as allowed. Records no gradient."""
+
+    def alone(own: Tensor) -> Answer:
         # Whether gradients are recorded is a setting of each thread.
         with torch.no_grad():
-            return shape.boundary_points(own)
+            return work(own)
 
-    if threads <= 1:
-        return part(latent)
-    return torch.cat(list(_pool(threads).map(part, latent.tensor_split(threads))))
+    threads = min(thread_count(), math.ceil(len(rows) / CHUNK))
+    parts = threads if most is None else max(threads, math.ceil(len(rows) / most))
+    if parts <= 1:
+        return [alone(rows)]
+    each = rows.tensor_split(parts)
+    return list(map(alone, each) if threads <= 1 else _pool(threads).map(alone, each))
 
 
 @cache

@@ -1,0 +1,122 @@
+"""Draws from all over the prior, in flat coordinates, that agree with the readings in contact.
+
+Where the data pin some entries given the others (`Coordinates.entries`), draws from all over the
+prior whose entries are standard normal agree with the readings already: a few of them show where
+all of the posterior lies, however many pieces it has.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tpcd.belief.cloud import Coordinates, Target
+from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.settings import SamplerSettings
+from tpcd.belief.weights import TRUSTED, finite, known_weights, threshold
+
+_AT_ONCE = 2000
+_POWER = 0.3
+"""Power of what the readings say about the rest, by which starts are chosen: they lie further apart
+than the posterior."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatDraws:
+    """Draws of all rounds, in flat coordinates."""
+
+    flat: Tensor
+    log_target: Tensor
+    """In flat coordinates, not normalised; -inf out of the box."""
+    log_sum: Tensor
+    """Log of the sum of the densities of all draws."""
+    starts: int
+    """How many draws from all over the prior were made for those among these."""
+
+    @property
+    def log_weights(self) -> Tensor:
+        """But for a constant."""
+        return finite(self.log_target - self.log_sum)
+
+    @property
+    def trusted(self) -> float:
+        """A log weight that some draws reach; -inf where none has any."""
+        if len(self.flat) == 0:
+            return -math.inf
+        return float(self.log_weights.topk(min(TRUSTED, len(self.flat))).values[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class FlatStart:
+    """What is known before the first round."""
+
+    coordinates: Coordinates
+    draws: FlatDraws
+    """From all over the prior, where they agree with the readings in contact."""
+    points: Float[Tensor, "f d"]
+    """Some of them (scores), from which to look for modes."""
+
+
+def flat_starts(
+    target: Target,
+    coordinates: Coordinates,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> FlatStart:
+    """Draws from all over the prior; few where the readings leave the boxes."""
+    drawn, flat, score, log_slope = _inside(target, coordinates, settings, generator)
+    log_prior = target.log_prior(score)
+    log_sum = log_start(coordinates, flat, score, log_prior) + math.log(drawn)
+    log_prior = finite(log_prior + log_slope)
+    first = torch.arange(len(flat))
+    if len(flat) > settings.fresh_modes:
+        weights = known_weights(_POWER * coordinates.log_marginal(flat))
+        first = systematic_resample(weights, settings.fresh_modes, generator).unique()
+    log_target = torch.full_like(log_sum, -torch.inf)
+    log_target[first] = finite(log_prior[first] + target.log_likelihood(score[first], None))
+    draws = FlatDraws(flat, log_target, log_sum, drawn)
+    if len(first) < len(flat):
+        # Those first ones tell which of the others are worth weighing.
+        least = threshold(draws.trusted, log_sum, log_prior)
+        least[first] = torch.inf
+        others = finite(log_prior + target.log_likelihood(score, least))
+        draws = replace(draws, log_target=torch.maximum(log_target, others))
+    return FlatStart(coordinates, draws, score[first])
+
+
+def _inside(
+    target: Target,
+    coordinates: Coordinates,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> tuple[int, Tensor, Tensor, Tensor]:
+    """Draws with standard normal entries that are in the boxes, until there are enough: how many
+    were made, flat coordinates, scores, and log |d score / d flat|."""
+    entries = list(coordinates.entries)
+    parts, drawn, found = [], 0, 0
+    while drawn < settings.flat_starts and found < settings.flat_draws:
+        count = min(_AT_ONCE, settings.flat_starts - drawn)
+        flat = target.sample(count, generator)
+        normal = torch.randn((count, len(entries)), generator=generator, dtype=flat.dtype)
+        flat[:, entries] = normal
+        score, log_slope = coordinates.to_score(flat)
+        inside = torch.isfinite(score).all(-1)
+        parts.append((flat[inside], score[inside], log_slope[inside]))
+        drawn, found = drawn + count, found + int(inside.sum())
+    flat, score, log_slope = (torch.cat(column) for column in zip(*parts, strict=True))
+    return drawn, flat, score, log_slope
+
+
+def log_start(
+    coordinates: Coordinates,
+    flat: Float[Tensor, "m d"],
+    score: Float[Tensor, "m d"],
+    log_prior: Float[Tensor, " m"],
+) -> Float[Tensor, " m"]:
+    """Log density in flat coordinates of the rest from the prior, and standard normal entries."""
+    own, e = (value[:, list(coordinates.entries)] for value in (score, flat))
+    return log_prior + 0.5 * (own**2 - e**2).sum(-1)

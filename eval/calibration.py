@@ -5,9 +5,10 @@ posterior: its place u = P(entry < true entry | data) is uniform when the poster
 `eval/drawn.py` says how exactly the episodes come from the likelihood's own model. So what is
 asked is whether likelihood and sampler are right.
 With `--estimator paper` the data are the same, while that filter assumes another noise: its
-ranks show what this costs. With `--estimator likelihood` there is no estimator: each true entry is
-placed given the true values of all others (`eval/conditional.py`), which asks about the default
-likelihood alone.
+ranks show what this costs. With `--estimator steps` the default's last belief is not drawn once
+more: that is what the next move is chosen by. With `--estimator likelihood` there is no estimator:
+each true entry is placed given the true values of all others (`eval/conditional.py`), which asks
+about the default likelihood alone.
 
 python -m eval.calibration --runs 200 --steps 10 --out runs/calibration
 """
@@ -42,8 +43,9 @@ class Calibration:
     """Runs in total, those already in the folder included."""
     steps: int = 10
     """Transitions of each episode."""
-    estimator: Literal["default", "paper", "likelihood"] = "default"
-    """Whose posterior to check; with "likelihood" that of each entry given all others."""
+    estimator: Literal["default", "steps", "paper", "likelihood"] = "default"
+    """Whose posterior to check; with "steps" the default's quick one between moves, with
+    "likelihood" that of each entry given all others."""
     prior: str = "ycb21-z2"
     """Shape prior: a folder or a shipped name."""
     quick: bool = False
@@ -192,7 +194,7 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
 
     from eval.conditional import conditional_places
     from eval.drawn import draw_episode
-    from tpcd.belief.belief import target_of
+    from tpcd.belief.belief import estimate, target_of
     from tpcd.belief.history import history_of
     from tpcd.belief.paper import PaperSettings
     from tpcd.belief.prior import make_prior
@@ -214,9 +216,12 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
             score = torch.cat((prior.to_score(truth[:-1]), misfit))
             place = conditional_places(target, score)
             return {"place": place.tolist(), "misfit_score": float(misfit)}
-        paper = PaperSettings(particles=particles)
-        estimator = Estimator(shape, config.estimator, settings, paper)
-        belief = estimator.learn(episode, generator).belief
+        if config.estimator == "steps":
+            *_, last = estimate(episode, shape, generator, settings)
+        else:
+            paper = PaperSettings(particles=particles)
+            last = Estimator(shape, config.estimator, settings, paper).learn(episode, generator)
+        belief = last.belief
     except ValueError as error:
         return {"failed": str(error)}
     found = torch.cat((belief.vectors, belief.misfit_sd[:, None]), dim=-1)

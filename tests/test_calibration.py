@@ -140,3 +140,15 @@ def test_a_run_can_be_continued_but_not_with_other_settings(tmp_path: Path) -> N
     assert (out / "figures" / "ranks.png").is_file()
     with pytest.raises(RunError, match="another steps"):
         calibrate(Calibration(out=out, runs=2, steps=3, quick=True, particles=64))
+
+
+def test_the_belief_between_moves_is_another_than_the_last_one(tmp_path: Path) -> None:
+    """Same truths and data; only the closing draws are left out."""
+    small = {"runs": 1, "steps": 2, "quick": True, "particles": 64}
+    places = []
+    for estimator in ("default", "steps"):
+        out = tmp_path / estimator
+        calibrate(Calibration(out=out, estimator=estimator, **small))
+        places.append(read_lines(out / "runs.jsonl")[0]["place"])
+    assert places[0] != places[1]
+    assert np.abs(np.subtract(*places)).max() < 0.5

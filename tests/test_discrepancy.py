@@ -15,7 +15,6 @@ from tpcd.belief.history import history_of, joined_history
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
-from tpcd.belief.settings import SamplerSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
@@ -23,7 +22,7 @@ from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, Coverage, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import Fit, Question
+from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
 from tpcd.discrepancy.heldout import Errors, folds, gaps, lower_bound, typical_share
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.report_parts import shown_value
@@ -39,7 +38,8 @@ from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
 SMALL = DiagnosisSettings(
-    sampler=SamplerSettings(
+    sampler=replace(
+        FIT_SAMPLER,
         particles=150,
         draws_per_place=9,
         draws=600,

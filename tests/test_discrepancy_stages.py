@@ -11,14 +11,13 @@ import torch
 from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
-from tpcd.belief.settings import SamplerSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy import naming, search
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Alternative
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import Fit, Question
+from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.discrepancy.workbench import Round, Workbench
@@ -32,7 +31,8 @@ from tpcd.truth.scene import draw_scene, make_truth
 
 CATALOGUE = tuple(find_effect(n) for n in ("floor_compliance", "wall_friction", "wall_tilt"))
 SETTINGS = DiagnosisSettings(
-    sampler=SamplerSettings(
+    sampler=replace(
+        FIT_SAMPLER,
         particles=60,
         draws_per_place=9,
         draws=200,

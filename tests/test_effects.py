@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tpcd.belief.filtered import HistoryLikelihood
 from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
@@ -64,20 +65,33 @@ def history() -> History:
     return history_of(record(truth, scene, motion, 8, generator).measured)
 
 
+@pytest.fixture(scope="module")
+def without() -> dict[bool, HistoryLikelihood]:
+    """Likelihoods without effects, by compiled loops or not, kept for all effects."""
+    return {}
+
+
 @pytest.mark.parametrize("effect", KNOWN, ids=lambda effect: effect.name)
 @pytest.mark.parametrize("compiled", [True, False])
 def test_null_values_change_no_bit(
-    effect: Effect, compiled: bool, history: History, monkeypatch: pytest.MonkeyPatch
+    effect: Effect,
+    compiled: bool,
+    history: History,
+    without: dict[bool, HistoryLikelihood],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if not compiled:
         monkeypatch.setattr(native, "available", lambda: False)
+        history = history.first(5)
     shape = PolygonShape(builtin_outlines()["mug"])
     prior = make_prior(shape)
     draws = prior.to_vector(prior.sample(6, torch.Generator().manual_seed(1)))
     null = torch.tensor([[p.null for p in effect.parameters]], dtype=torch.float64)
     field, sd = MisfitField(5e-4), torch.full((6,), 5e-4, dtype=torch.float64)
     arguments = (shape, Parameters.from_vector(draws), sd, history, field, StepSettings())
-    base = history_likelihood(*arguments)
+    if compiled not in without:
+        without[compiled] = history_likelihood(*arguments)
+    base = without[compiled]
     found = history_likelihood(*arguments, added=Added((effect,), null.expand(6, -1)))
     assert torch.equal(found.total, base.total)
     assert torch.equal(found.field_mean, base.field_mean)

@@ -36,6 +36,8 @@ from tpcd.belief.weights import (
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
+_EVEN = 2.0
+"""Of few draws that have a weight each counts so many times its even share at most."""
 
 
 def assimilate(
@@ -94,7 +96,7 @@ def adapt(
     for left in reversed(range(settings.rounds)):
         trial, by_damping = trial.add(target, mixture, generator)
         log_weights = trial.log_weights
-        weights = evened(log_weights, math.sqrt(len(log_weights)))
+        weights = evened(log_weights, math.sqrt(len(log_weights)), _EVEN)
         worth = weights @ by_damping.softmax(-1).nan_to_num(0.0)
         shares = worth.clamp_min(_LEAST_SHARE) / worth.clamp_min(_LEAST_SHARE).sum()
         if left == 0:

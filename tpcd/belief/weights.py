@@ -64,11 +64,13 @@ def cut_off(weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
     return weights
 
 
-def evened(log_weights: Float[Tensor, " n"], count: float) -> Float[Tensor, " n"]:
-    """Weights that sum to 1, of which none is more than 1 / count, or than ten times its even share
-    where few have any. Raises ValueError where all are zero."""
+def evened(
+    log_weights: Float[Tensor, " n"], count: float, most: float = _LARGEST_SHARE
+) -> Float[Tensor, " n"]:
+    """Weights that sum to 1, of which none is more than 1 / count, or, where few are above zero,
+    than `most` times its even share of them. Raises ValueError where all are zero."""
     weights = known_weights(log_weights)
-    return cut_off(weights, min(count, float((weights > 0).sum()) / _LARGEST_SHARE))
+    return cut_off(weights, min(count, float((weights > 0).sum()) / most))
 
 
 def spread_choice(log_weights: Tensor, count: int, generator: torch.Generator) -> Tensor:

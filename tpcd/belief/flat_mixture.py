@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tpcd.belief.proposals import DEGREES_OF_FREEDOM
+from tpcd.belief.proposals import DEGREES_OF_FREEDOM, summed
 from tpcd.belief.resampling import systematic_resample
 from tpcd.simulator import native
 
@@ -93,15 +93,7 @@ class FlatMixture:
         width = unit.new_tensor(WIDTHS)
         parts = (self.centres.mT, width, _kept(width))
         components = FlatComponents(*(part.contiguous().numpy() for part in parts))
-        total = unit.new_empty(len(unit), len(WIDTHS))
-        given, found = unit.contiguous().numpy(), total.numpy()
-        native.in_parts(
-            lambda first, last: flat_sum_range(
-                given, components, DEGREES_OF_FREEDOM, found, first, last
-            ),
-            len(unit),
-        )
-        return total
+        return summed(flat_sum_range, unit, components, len(WIDTHS))
 
 
 def flat_mixture(

@@ -20,7 +20,7 @@ deviation 1. Components have Student tails.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -123,15 +123,23 @@ class CurvedMixture:
             peak.T,
         )
         components = Components(*(part.contiguous().numpy() for part in parts))
-        total = torch.empty(len(points), self.offset.shape[1], dtype=torch.float64)
-        given, found = points.contiguous().numpy(), total.numpy()
-        native.in_parts(
-            lambda first, last: sum_range(
-                given, components, DEGREES_OF_FREEDOM, found, first, last
-            ),
-            len(points),
-        )
-        return total
+        return summed(sum_range, points, components, self.offset.shape[1])
+
+
+def summed(
+    sum_range: Callable[..., None],
+    points: Float[Tensor, "m d"],
+    components: tuple,
+    sizes: int,
+) -> Float[Tensor, "m t"]:
+    """Sums of densities at points over components of each of t sizes, by a compiled loop."""
+    total = torch.empty(len(points), sizes, dtype=torch.float64)
+    given, found = points.contiguous().numpy(), total.numpy()
+    native.in_parts(
+        lambda first, last: sum_range(given, components, DEGREES_OF_FREEDOM, found, first, last),
+        len(points),
+    )
+    return total
 
 
 def curved_mixture(

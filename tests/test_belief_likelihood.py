@@ -178,10 +178,9 @@ def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Surfaces that yield answer to the change of load since then."""
-    history = history_of(episode)
     if not compiled:
         monkeypatch.setattr(native, "available", lambda: False)
-        history, particles = history.first(4), particles[:8]
+    history = history_of(episode)
     effects = tuple(find_effect(name) for name in ("floor_compliance", "tangential_compliance"))
     added = Added(effects, torch.full((len(particles), 2), 4e-4, dtype=torch.float64))
     scene = scene_from_parameters(shape, Parameters.from_vector(particles))

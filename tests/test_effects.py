@@ -82,7 +82,6 @@ def test_null_values_change_no_bit(
 ) -> None:
     if not compiled:
         monkeypatch.setattr(native, "available", lambda: False)
-        history = history.first(5)
     shape = PolygonShape(builtin_outlines()["mug"])
     prior = make_prior(shape)
     draws = prior.to_vector(prior.sample(6, torch.Generator().manual_seed(1)))

@@ -29,10 +29,10 @@ than the posterior."""
 class FlatDraws:
     """Draws of all rounds, in flat coordinates."""
 
-    flat: Tensor
-    log_target: Tensor
+    flat: Float[Tensor, "n d"]
+    log_target: Float[Tensor, " n"]
     """In flat coordinates, not normalised; -inf out of the box."""
-    log_sum: Tensor
+    log_sum: Float[Tensor, " n"]
     """Log of the sum of the densities of all draws."""
     starts: int
     """How many draws from all over the prior were made for those among these."""
@@ -101,8 +101,8 @@ def _inside(
     while drawn < settings.flat_starts and found < settings.flat_draws:
         count = min(_AT_ONCE, settings.flat_starts - drawn)
         flat = target.sample(count, generator)
-        normal = torch.randn((count, len(entries)), generator=generator, dtype=flat.dtype)
-        flat[:, entries] = normal
+        size = (count, len(entries))
+        flat[:, entries] = torch.randn(size, generator=generator, dtype=flat.dtype)
         score, log_slope = coordinates.to_score(flat)
         inside = torch.isfinite(score).all(-1)
         parts.append((flat[inside], score[inside], log_slope[inside]))

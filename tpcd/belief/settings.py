@@ -31,7 +31,7 @@ class SamplerSettings:
     """Draws at most from all over the prior, of which some that agree with the readings in contact
     set out to climb too; once `flat_draws` of them agree there are enough."""
     flat_draws: int = 300
-    """Draws of each of those rounds but the last."""
+    """Draws of each flat round but the last."""
     prior_draws: int = 200
     """Draws from the prior at the first datum, falling as 1 / k with datum k."""
     modes: int = 8

@@ -145,13 +145,32 @@ def test_as_many_starts_are_drawn_as_there_need_be() -> None:
     weights = torch.full((500,), 1 / 500, dtype=torch.float64)
     coordinates = target.coordinates(start(), weights)
     for most, needed, expected in ((50_000, 1000, 2000), (50_000, 3000, 4000), (1500, 3000, 1500)):
-        settings = replace(SETTINGS, flat_starts=most, flat_draws=needed)
+        settings = replace(SETTINGS, flat_starts=most, flat_enough=needed)
         found = flat_starts(target, coordinates, settings, torch.Generator().manual_seed(1))
         assert found.draws.starts == expected and len(found.draws.flat) == expected
         own = found.draws.log_weights
         std = math.sqrt(1 / effective_sample_size(own.softmax(0)) - 1 / expected)
         assert std < 0.3 and abs(float(torch.logsumexp(own, 0)) - log_evidence) < 4 * std
         assert 0 < len(found.points) <= settings.fresh_modes
+
+
+def test_those_climb_that_are_in_the_basin_of_a_narrow_mode() -> None:
+    """Few starts are, and all of them far below its top."""
+    model, top = LinearModel(2), torch.tensor([1.5, -1.5, 1.0], dtype=torch.float64)
+
+    def peaked(x: Tensor) -> Tensor:
+        return (60 - 80 * (x - top).norm(dim=-1)).clamp_min(0.0)
+
+    target = model.target(2, peaked)
+    weights = torch.full((500,), 1 / 500, dtype=torch.float64)
+    coordinates = target.coordinates(start(), weights)
+    settings = replace(SETTINGS, flat_starts=2000, flat_enough=2000, fresh_modes=40)
+    found = flat_starts(target, coordinates, settings, torch.Generator().manual_seed(7))
+    scores = coordinates.to_score(found.draws.flat)[0]
+    of_all = (peaked(scores) > 0).double().mean()
+    of_climbing = (peaked(found.points) > 0).double().mean()
+    assert 0.001 < of_all < 0.1 and of_climbing > 4 * of_all
+    assert peaked(found.points).max() == peaked(scores).max() < 58
 
 
 def test_the_same_generator_gives_the_same_draws() -> None:

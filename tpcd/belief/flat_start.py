@@ -2,7 +2,8 @@
 
 Where the data pin some entries given the others (`Coordinates.entries`), draws from all over the
 prior whose entries are standard normal agree with the readings already: a few of them show where
-all of the posterior lies, however many pieces it has.
+all of the posterior lies, however many pieces it has. A narrow mode is met by none of them; those
+in its basin show by their weights where it is worth climbing.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ from tpcd.belief.weights import TRUSTED, finite, known_weights, threshold
 
 _AT_ONCE = 2000
 _POWER = 0.3
-"""Power of what the readings say about the rest, by which starts are chosen: they lie further apart
-than the posterior."""
+"""Power of what the readings say about the rest, by which the first ones to be weighed are chosen:
+they lie further apart than the posterior."""
+_CLIMBING_POWER = 0.1
+"""Power of the weights by which those are chosen that climb. The basin of a narrow mode is far
+below its top, and above its surroundings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +89,11 @@ def flat_starts(
         least[first] = torch.inf
         others = finite(log_prior + target.log_likelihood(score, least))
         draws = replace(draws, log_target=torch.maximum(log_target, others))
-    return FlatStart(coordinates, draws, score[first])
+    climbing = first
+    if bool((draws.log_weights > -torch.inf).any()):
+        weights = known_weights(_CLIMBING_POWER * draws.log_weights)
+        climbing = systematic_resample(weights, settings.fresh_modes, generator).unique()
+    return FlatStart(coordinates, draws, score[climbing])
 
 
 def _inside(
@@ -98,7 +106,7 @@ def _inside(
     were made, flat coordinates, scores, and log |d score / d flat|."""
     entries = list(coordinates.entries)
     parts, drawn, found = [], 0, 0
-    while drawn < settings.flat_starts and found < settings.flat_draws:
+    while drawn < settings.flat_starts and found < settings.flat_enough:
         count = min(_AT_ONCE, settings.flat_starts - drawn)
         flat = target.sample(count, generator)
         size = (count, len(entries))

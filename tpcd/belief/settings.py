@@ -29,7 +29,9 @@ class SamplerSettings:
     """Effective number of draws of the rounds so far with which the next one is the last."""
     flat_starts: int = 3000
     """Draws at most from all over the prior, of which some that agree with the readings in contact
-    set out to climb too; once `flat_draws` of them agree there are enough."""
+    set out to climb too,"""
+    flat_enough: int = 300
+    """and how many that agree are enough."""
     flat_draws: int = 300
     """Draws of each flat round but the last."""
     prior_draws: int = 200
@@ -53,6 +55,7 @@ class SamplerSettings:
             "flat_rounds": 0,
             "flat_worth": 0,
             "flat_starts": 1,
+            "flat_enough": 1,
             "flat_draws": 100,
             "draws": 100,
             "prior_draws": 1,
@@ -73,11 +76,13 @@ CLOSING_SAMPLER = SamplerSettings(
     draws=20_000,
     flat_rounds=8,
     flat_worth=math.inf,
-    flat_starts=40_000,
+    flat_starts=100_000,
+    flat_enough=30_000,
     flat_draws=3000,
     prior_draws=1500,
     modes=40,
-    fresh_modes=240,
+    fresh_modes=480,
+    climbing_rounds=4,
 )
 """Budget of the belief that is left once no more data are to come."""
 
@@ -90,10 +95,10 @@ class EstimatorSettings:
     """Budget of the sampler after each transition."""
     closing: SamplerSettings = CLOSING_SAMPLER
     """Budget once no more data are to come (see `refine`), for as many particles as the other."""
-    closing_passes: int = 2
+    closing_passes: int = 4
     """Times at most that mixtures in flat coordinates are adapted, each time from where draws of
     those before lie."""
-    closing_worth: float = 300.0
+    closing_worth: float = 150.0
     """Effective number of closing draws with which they need not be adapted again."""
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""

@@ -23,6 +23,7 @@ from tpcd.data.episode import Episode
 from tpcd.effects import find_effect
 from tpcd.exploration import Estimator
 from tpcd.shape.checkpoint import load_prior
+from tpcd.simulator import native
 
 PRIOR, STEPS = "ycb21-z2", 4
 SETTINGS = EstimatorSettings(
@@ -206,3 +207,27 @@ def test_a_state_gives_back_the_belief_that_left_it(
     for name in ("vectors", "weights", "misfit_sd", "misfit_mean", "misfit_covariance"):
         assert torch.equal(getattr(held, name), getattr(steps[1].belief, name))
     assert Estimator(estimator.shape, "paper").held(episode, steps[1].state) is None
+
+
+@pytest.mark.skipif(not native.available(), reason="without compiled loops torch keeps its threads")
+def test_torch_takes_one_thread_meanwhile_and_as_many_as_before_afterwards(
+    episode: Episode, estimator: Estimator, steps: list[EstimationStep]
+) -> None:
+    """So the answer does not depend on how many it may take."""
+    alone = refine(episode, estimator.shape, steps[-1].state, SETTINGS)
+    before = torch.get_num_threads()
+    seen: list[int] = []
+
+    def fails() -> None:
+        seen.append(torch.get_num_threads())
+        raise ValueError
+
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(ValueError):
+            native.torch_in_one_thread(fails)()
+        beside = refine(episode, estimator.shape, steps[-1].state, SETTINGS)
+        assert seen == [1] and torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(alone.belief.vectors, beside.belief.vectors)

@@ -33,6 +33,7 @@ from tpcd.belief.weights import (
     spread_choice,
     threshold,
 )
+from tpcd.simulator.native import torch_in_one_thread
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""
@@ -56,6 +57,7 @@ def assimilate(
     return after, pool.info(settings.rounds, len(after.weights))
 
 
+@torch_in_one_thread
 def draw_pool(
     cloud: Cloud,
     target: Target,

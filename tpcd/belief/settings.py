@@ -19,7 +19,7 @@ class SamplerSettings:
     """Places that each round of importance sampling puts components at, besides the modes."""
     draws_per_place: int = 5
     """Draws at each place."""
-    rounds: int = 2
+    rounds: int = 1
     """Rounds of importance sampling that shape the mixture."""
     draws: int = 1000
     """Draws from the mixture that the rounds arrived at, which are weighted."""

@@ -10,9 +10,9 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, wraps
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -85,6 +85,7 @@ def decode(shape: Shape, latent: Float[Tensor, "m z"]) -> Float[Tensor, "m p 2"]
 
 
 Answer = TypeVar("Answer")
+Work = TypeVar("Work", bound=Callable[..., Any])
 
 
 def over_threads(
@@ -104,6 +105,25 @@ def over_threads(
         return [alone(rows)]
     each = rows.tensor_split(parts)
     return list(map(alone, each) if threads <= 1 else _pool(threads).map(alone, each))
+
+
+def torch_in_one_thread(work: Work) -> Work:
+    """The same with torch in one thread where there are compiled loops, whose threads it would
+    only get in the way of: between them its operations are small. Its answers then do not depend
+    on how many threads torch may take."""
+
+    @wraps(work)
+    def alone(*given: Any, **named: Any) -> Any:
+        allowed = torch.get_num_threads()
+        if not available() or allowed == 1:
+            return work(*given, **named)
+        torch.set_num_threads(1)
+        try:
+            return work(*given, **named)
+        finally:
+            torch.set_num_threads(allowed)
+
+    return cast(Work, alone)
 
 
 @cache

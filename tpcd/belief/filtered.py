@@ -71,7 +71,7 @@ def filter_history(
     settled: list[tuple[Tensor, Tensor, Tensor]] = []
     nothing = (
         sd.new_zeros(m, 3),
-        torch.zeros(m, terrains, dtype=torch.long),
+        torch.zeros(m, terrains, dtype=torch.long, device=sd.device),
         sd.new_zeros(m, terrains, 4),
     )
     for k in range(n):
@@ -162,8 +162,9 @@ def _touching(
 
 def _column(scene: ContactScene, row: int) -> ContactScene:
     """The scenes (m) at a row of the batch (m, r)."""
-    count = scene.batch_shape[0]
-    return scene.columns(torch.tensor([row])).gather(torch.arange(count))
+    count, device = scene.batch_shape[0], scene.friction.device
+    column = scene.columns(torch.tensor([row], device=device))
+    return column.gather(torch.arange(count, device=device))
 
 
 def _row(value: Tensor, row: int) -> Tensor:

@@ -71,7 +71,7 @@ def test_settled_poses_move_with_theta_as_automatic_derivatives_say(
             readings=history.readings[k : k + 2],
             merged=Merged(**{**merged, "variance": unit**2 * known[None]}),
         )
-        found, _ = linearised_likelihood(
+        found, _, _ = linearised_likelihood(
             prior.shape, vectors, slopes, torch.zeros(8).double(), one, MisfitField(0.0), settings
         )
         theta = vectors.clone().requires_grad_()
@@ -113,7 +113,7 @@ def test_friction_that_is_left_out_moves_nothing() -> None:
     noise = torch.tensor([2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02]).double()
     episode = Episode(commands, poses, STIFFNESS * (poses - commands), STIFFNESS, noise)
     history = history_of(episode)
-    found, _ = linearised_likelihood(
+    found, _, _ = linearised_likelihood(
         prior.shape,
         vectors,
         torch.ones_like(vectors),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -46,6 +46,11 @@ class HistoryLikelihood:
     log_scale: Float[Tensor, "m n 3"] | None = None
     slopes: Float[Tensor, "m d n 3"] | None = None
     steps: Steps | None = None
+
+    def __getitem__(self, index: Tensor) -> HistoryLikelihood:
+        """Of some particles, without how their transitions settled."""
+        values = {name: v[index] for name, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **values, steps=None)
 
 
 def filter_history(

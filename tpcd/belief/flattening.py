@@ -47,6 +47,8 @@ FAR_OFF = 3.0
 """Mean deviations that points may be off a row."""
 LARGEST_MISFIT = 0.1
 """The map takes no misfit to be larger [m]: beyond, nothing is left of the readings anyway."""
+_OUTLINES_AT_ONCE = 128
+"""Outlines whose points are measured along all normals at once, in fast memory."""
 _TOUCHES_AT_ONCE = 30_000
 """Points times touches that are held in memory at once, for all points of an outline."""
 
@@ -177,7 +179,9 @@ class Flattening:
         parameters = self.prior.parameters_of(vector)
         points = self.prior.shape.boundary_points(parameters.latent).double()
         angle = self.poses[:, 2] + parameters.mount[:, 2:]
-        support = (points @ rotate(-angle, self.normals).mT).amin(1)
+        turned = rotate(-angle, self.normals)
+        parts = zip(turned.split(_OUTLINES_AT_ONCE), points.split(_OUTLINES_AT_ONCE), strict=True)
+        support = torch.cat([(normals @ outlines.mT).amin(-1) for normals, outlines in parts])
         along = rotate(-self.poses[:, 2], self.normals)
         offset = offset_signs(self.terrains, along)
         fixed = torch.cat((along, torch.zeros_like(along[:, :1]), -offset), dim=-1)

@@ -63,16 +63,18 @@ class StartGaps:
         if field.bumps:
             gap = gap + field.gap(mean[:, None], self.angle)
             variance = variance + field.gap_variance(covariance, sd, self.angle)
-        each = torch.special.log_ndtr(gap / variance.sqrt())
-        total = each.amin(-2).sum(-1)
-        return torch.where(torch.isfinite(total), total, -torch.inf)
+        return _log_free(gap, variance)
 
     def log_free_before(self, field: MisfitField, sd: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """The same before any data: no more than that can all of them together be likely."""
-        count = field.bumps * self.gap.shape[-1]
-        mean = sd.new_zeros(len(sd), count)
-        diagonal = (sd**2)[:, None].expand(-1, count)
-        return self.log_free(field, sd, mean, torch.diag_embed(diagonal))
+        known, _ = field.basis(self.angle)
+        of_field = (known**2).sum(-1) + field.uncovered(known) if field.bumps else 0 * self.angle
+        return _log_free(self.gap, self.variance + (sd**2)[:, None, None] * of_field[:, None])
+
+
+def _log_free(gap: Tensor, variance: Tensor) -> Tensor:
+    total = torch.special.log_ndtr(gap / variance.sqrt()).amin(-2).sum(-1)
+    return torch.where(torch.isfinite(total), total, -torch.inf)
 
 
 def start_gaps(

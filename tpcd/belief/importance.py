@@ -79,7 +79,8 @@ def adapt(
 ) -> Adapted:
     """A proposal that starts at the cloud and the modes, and goes to where the weight is."""
     target = Counted(target)
-    brought_on = known_weights(_brought_on(cloud, target))
+    log_likelihood, brought_on = _brought_on(cloud, target)
+    brought_on = known_weights(brought_on)
     begun = None
     if settings.flat_rounds:
         coordinates = target.coordinates(cloud.positions, brought_on)
@@ -88,10 +89,11 @@ def adapt(
     peaks = find_modes(target, cloud.modes, settings, generator, fresh)
     shares = cloud.shares
     counts = _counts(shares, settings.draws_per_place)
+    followers = _follow(cloud, log_likelihood, brought_on.log(), target, settings, generator)
     mixture = CurvedMixture.joined(
         [
             curved_mixture(each.points, each.gradient, each.information, counts)
-            for each in (peaks, _follow(cloud, brought_on.log(), target, settings, generator))
+            for each in (peaks, followers)
         ]
     )
     trial = _of_prior(target, max(1, settings.prior_draws // datum), generator)
@@ -209,21 +211,26 @@ def _of_prior(target: Target, count: int, generator: torch.Generator) -> _Draws:
     return _Draws(positions, log_prior, log_likelihood, log_prior + math.log(count), None, count)
 
 
-def _brought_on(cloud: Cloud, target: Target) -> Tensor:
-    """Log weights of the particles with the new datum."""
-    gain = target.log_likelihood(cloud.positions, None) - cloud.log_likelihood
+def _brought_on(cloud: Cloud, target: Target) -> tuple[Tensor, Tensor]:
+    """Log likelihoods of the particles with the new datum, and their log weights."""
+    log_likelihood = target.log_likelihood(cloud.positions, None)
+    gain = log_likelihood - cloud.log_likelihood
     log_weights = torch.where(torch.isfinite(gain), gain, -torch.inf) + cloud.weights.log()
     # Where nobody explains it, those of the history before.
-    return log_weights if bool(torch.isfinite(log_weights).any()) else cloud.weights.log()
+    some = bool(torch.isfinite(log_weights).any())
+    return log_likelihood, log_weights if some else cloud.weights.log()
 
 
 def _follow(
     cloud: Cloud,
+    log_likelihood: Tensor,
     log_weights: Tensor,
     target: Target,
     settings: SamplerSettings,
     generator: torch.Generator,
 ) -> Climbers:
     """Particles that explain the new datum best, a damped Newton step on."""
-    places = cloud.positions[spread_choice(log_weights, settings.places, generator)]
-    return climb(target, set_out(target, places), 1).surveyed(target)
+    chosen = spread_choice(log_weights, settings.places, generator)
+    places = cloud.positions[chosen]
+    height = finite(target.log_prior(places) + log_likelihood[chosen])
+    return climb(target, set_out(target, places, height), 1).surveyed(target)

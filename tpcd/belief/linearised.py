@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -23,6 +25,14 @@ _DIFFERENCE = 1e-3
 """Difference of a coordinate by which a scene moves for its derivatives."""
 
 
+class Linearised(NamedTuple):
+    """The likelihood with derivatives, that with another misfit, and what effects answer to."""
+
+    found: HistoryLikelihood
+    moved_misfit: HistoryLikelihood | None
+    outcome: Outcome | None
+
+
 def linearised_likelihood(
     shape: Shape,
     vectors: Float[Tensor, "m d"],
@@ -32,9 +42,10 @@ def linearised_likelihood(
     field: MisfitField,
     settings: StepSettings,
     added: Added | None = None,
-) -> tuple[HistoryLikelihood, Outcome | None]:
+    moved_sd: Float[Tensor, " m"] | None = None,
+) -> Linearised:
     """The likelihood with the derivatives of its innovations by d coordinates, in compiled loops,
-    and the outcome that effects answer to.
+    and that with a misfit of `moved_sd` [m] instead, in the same loops.
 
     `vectors` are theta, and `slopes` the derivatives of each entry by its own coordinate. The
     scene moves by differences, the settled poses by the derivatives of the rest equations,
@@ -65,13 +76,13 @@ def linearised_likelihood(
     setting, outcome = history.setting(scene), None
     if added is not None and added.effects:
         setting, outcome = effective_setting(scene, history, misfit_sd, field, settings, added)
+    points_ee, sd = scene.points_ee, misfit_sd
+    if moved_sd is not None:
+        twice = torch.arange(m).repeat(2)
+        points_ee, sd, setting = points_ee[twice], torch.cat((sd, moved_sd)), setting[twice]
+        parts = [np.concatenate((part, np.zeros_like(part))) for part in parts]
     found = compiled_filter(
-        scene.points_ee,
-        setting,
-        misfit_sd,
-        field,
-        settings,
-        innovations=True,
-        by_theta=SceneSlopes(*parts),
+        points_ee, setting, sd, field, settings, innovations=True, by_theta=SceneSlopes(*parts)
     )
-    return found, outcome
+    moved_misfit = None if moved_sd is None else found[torch.arange(m, 2 * m)]
+    return Linearised(found[torch.arange(m)], moved_misfit, outcome)

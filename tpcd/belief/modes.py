@@ -53,12 +53,14 @@ class Climbers:
         )
 
 
-def set_out(target: Target, points: Float[Tensor, "k d"]) -> Climbers:
-    """Points before they climb."""
+def set_out(
+    target: Target, points: Float[Tensor, "k d"], height: Float[Tensor, " k"] | None = None
+) -> Climbers:
+    """Points before they climb, whose log targets may be known."""
     k, d = points.shape
     return Climbers(
         points=points,
-        height=log_target(target, points),
+        height=log_target(target, points) if height is None else height,
         gradient=torch.zeros_like(points),
         information=points.new_zeros(k, d, d),
         known=torch.zeros(k, dtype=torch.bool),
@@ -74,9 +76,11 @@ def find_modes(
 ) -> Climbers:
     """The highest distinct modes, with gradient and information; `fresh` points climb besides
     those from all over the prior."""
-    points = target.scatter(settings.fresh_modes, generator)
+    points = torch.cat((remembered, target.scatter(settings.fresh_modes, generator)))
     start = set_out(target, points if fresh is None else torch.cat((points, fresh)))
-    start = set_out(target, remembered).beside(climb_with_the_best(target, start, settings))
+    order = torch.arange(len(start.points))
+    known, new = start[order[: len(remembered)]], start[order[len(remembered) :]]
+    start = known.beside(climb_with_the_best(target, new, settings))
     arrived = climb(target, start, settings.following_rounds).surveyed(target)
     points, information = arrived.points, arrived.information
     kept: list[int] = []

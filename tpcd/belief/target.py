@@ -105,7 +105,7 @@ class ContactTarget:
         assert self.history is not None
         vectors, slope = self.prior.to_vector_with_slope(score[:, :-1])
         scene, added = self.prior.scene_dimension, self.prior.added_of(vectors)
-        here, outcome = linearised_likelihood(
+        here, moved_misfit, outcome = linearised_likelihood(
             self.prior.shape,
             vectors[:, :scene],
             slope[:, :scene],
@@ -114,7 +114,9 @@ class ContactTarget:
             self.misfit,
             self.step,
             added,
+            self.misfit.sd_of(score[:, -1] + _DIFFERENCE),
         )
+        assert moved_misfit is not None
         parity, parity_scale = self.parity(score)
         whitened = torch.cat((_known(here.whitened), parity), dim=1)
         log_scale = torch.cat((_known(here.log_scale), parity_scale), dim=1)
@@ -124,7 +126,9 @@ class ContactTarget:
         for entry in range(scene, s):
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE
-            there = self.evaluate(moved, innovations=True, outcome=outcome)
+            there = moved_misfit
+            if entry < s - 1:
+                there = self.evaluate(moved, innovations=True, outcome=outcome)
             parity, parity_scale = self.parity(moved)
             found = torch.cat((_known(there.whitened), parity), dim=1)
             scale = torch.cat((_known(there.log_scale), parity_scale), dim=1)

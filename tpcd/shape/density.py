@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -129,25 +130,35 @@ class MixtureDensity:
     def _parts(self, latent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Log density (m, k) of each weighted component at the flattened latents, and the
         components' precisions P and P m."""
-        z = latent.shape[-1]
-        means, factors = self.means.to(latent.device), self.factors.to(latent.device)
         # (x - m)' P (x - m) = x' P x - 2 m' P x + m' P m for all components by two matrix
         # products with x x' and x, in double precision as the terms cancel.
-        flat = latent.reshape(-1, z).double()
-        precision = torch.cholesky_inverse(factors)
-        linear = (precision @ means[..., None])[..., 0]
-        log_scale = (
-            self.weights.to(latent.device).log()
-            - factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-            - 0.5 * (z * math.log(2 * math.pi) + (linear * means).sum(-1))
-        )
+        flat = latent.reshape(-1, latent.shape[-1]).double()
+        log_scale, linear, precision = (form.to(latent.device) for form in self._forms)
         products = (flat[:, :, None] * flat[:, None, :]).flatten(1)
         parts = log_scale + flat @ linear.mT - 0.5 * products @ precision.flatten(1).mT
         return parts, precision, linear
 
+    @cached_property
+    def _forms(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Log (k) of each weighted component at zero, P m and the precision P."""
+        means, factors = self.means, self.factors
+        precision = torch.cholesky_inverse(factors)
+        linear = (precision @ means[..., None])[..., 0]
+        log_scale = (
+            self.weights.log()
+            - factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+            - 0.5 * (means.shape[-1] * math.log(2 * math.pi) + (linear * means).sum(-1))
+        )
+        return log_scale, linear, precision
+
     def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
         """Whether the latent lies in the box and above the density floor."""
-        return self._valid(latent, self.raw_log_density(latent))
+        # Where one component alone is above it the sum is, and need not be taken.
+        parts, _, _ = self._parts(latent)
+        raw = parts.amax(-1)
+        low = torch.nonzero(~(raw >= self.floor)).flatten()
+        raw = raw.index_copy(0, low, torch.logsumexp(parts[low], dim=-1))
+        return self._valid(latent, raw.reshape(latent.shape[:-1]).to(latent.dtype))
 
     def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
         """Log density normalised on the valid region, -inf elsewhere."""

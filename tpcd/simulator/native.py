@@ -35,6 +35,9 @@ JAMMED = 4
 """Status of an element that the compiled loops leave to the torch path."""
 CHUNK = 64
 """Fewest transitions handed to a thread at once."""
+_ROWS = 512
+"""Fewest rows that `over_threads` hands to a thread: small torch operations in two threads wait for
+the interpreter, and for each other."""
 
 
 def available() -> bool:
@@ -99,7 +102,7 @@ def over_threads(
         with torch.no_grad():
             return work(own)
 
-    threads = min(thread_count(), math.ceil(len(rows) / CHUNK))
+    threads = min(thread_count(), math.ceil(len(rows) / _ROWS))
     parts = threads if most is None else max(threads, math.ceil(len(rows) / most))
     if parts <= 1:
         return [alone(rows)]

@@ -17,6 +17,7 @@ from tpcd.belief.history import History, history_of
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.settings import EstimatorSettings
 from tpcd.belief.target import ContactTarget
+from tpcd.planar import rotate
 from tpcd.shape.checkpoint import load_prior
 
 SETTINGS = EstimatorSettings(misfit_sd=2e-4, misfit_spread=0.0)
@@ -182,6 +183,28 @@ def test_absurd_points_do_not_disturb_their_neighbours(
     assert torch.isfinite(flat).all()
     back, _ = found.to_score(flat)
     torch.testing.assert_close(back[:3], many[:3], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 100])
+def test_touches_are_where_each_outline_is_lowest(
+    episodes: list[tuple[Tensor, ContactTarget]], at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many outlines are taken at once, for each as a loop over its points says."""
+    monkeypatch.setattr("tpcd.belief.flattening._OUTLINES_AT_ONCE", at_once)
+    truth, target = episodes[0]
+    found = at_truth(truth, target)
+    noise = torch.randn(7, truth.shape[-1], generator=torch.Generator().manual_seed(1)).double()
+    vector = target.prior.to_vector((truth + 0.5 * noise)[:, :-1])
+    design, _ = found._touches(vector)
+    scale = found.entries.index(target.prior.names.index("scale"))
+    parameters = target.prior.parameters_of(vector)
+    assert len(found.poses) > 1
+    for k, outline in enumerate(target.prior.shape.boundary_points(parameters.latent).double()):
+        for c, normal in enumerate(found.normals):
+            angle = found.poses[c, 2] + parameters.mount[k, 2]
+            lowest = (rotate(angle[None], outline) @ normal).min()
+            torch.testing.assert_close(design[k, c, scale], lowest)
+    assert found._touches(vector[:0])[0].shape == (0, len(found.poses), 6)
 
 
 def test_the_linear_entries_are_named_in_the_order_of_theta() -> None:

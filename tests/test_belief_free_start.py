@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.belief import prior_belief
-from tpcd.belief.free_start import free_starts, start_gaps
+from tpcd.belief.free_start import StartGaps, free_starts, start_gaps
 from tpcd.belief.history import History, history_of, joined_history
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
@@ -67,6 +67,27 @@ def total(shape: PolygonShape, vectors: Tensor, history: History, **further) -> 
     return history_likelihood(
         shape, parameters, sd, history, FIELD, StepSettings(), **further
     ).total
+
+
+@pytest.mark.parametrize("field", [FIELD, MisfitField(SD, 1.0, grain=0.3), MisfitField(0.0)])
+def test_before_any_data_is_with_the_prior_covariance(field: MisfitField) -> None:
+    """At angles on a bump, between two and beyond all of them; also for absurd particles, beside
+    which the others are as they would be alone."""
+    random = torch.Generator().manual_seed(0)
+    gap = 1e-3 * torch.randn(7, 4, 2, generator=random, dtype=torch.float64)
+    variance = 1e-7 * (1 + torch.rand(7, 4, 2, generator=random, dtype=torch.float64))
+    gap[5] = torch.nan
+    angle = torch.tensor([0.0, 0.07, -0.45, 2.0], dtype=torch.float64)
+    starts = StartGaps(gap, variance, angle)
+    sd = torch.tensor([1e-5, 1e-4, 5e-4, 1e-3, 1e-2, 1e-3, torch.nan], dtype=torch.float64)
+    count = field.bumps * 2
+    covariance = torch.diag_embed((sd**2)[:, None].expand(-1, count))
+    expected = starts.log_free(field, sd, torch.zeros(7, count, dtype=torch.float64), covariance)
+    found = starts.log_free_before(field, sd)
+    torch.testing.assert_close(found, expected)
+    assert torch.isfinite(found[:5]).all() and found[5] == -torch.inf
+    one = StartGaps(gap[3:4], variance[3:4], angle)
+    torch.testing.assert_close(one.log_free_before(field, sd[3:4]), found[3:4])
 
 
 def test_the_probability_is_that_of_a_normal_gap(shape: PolygonShape) -> None:

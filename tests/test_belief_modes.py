@@ -130,6 +130,39 @@ def test_each_mode_is_found_once_and_remembered() -> None:
     torch.testing.assert_close(again.points, peaks.points, atol=1e-3, rtol=0)
 
 
+def test_points_of_known_height_set_out_without_being_evaluated() -> None:
+    counted = Counted(ThreeModes())
+    points = counted.sample(20, torch.Generator().manual_seed(4))
+    height = log_target(ThreeModes(), points)
+    told = set_out(counted, points, height)
+    assert counted.evaluations == 0
+    asked = set_out(counted, points)
+    assert counted.evaluations == 20
+    for name, value in vars(told).items():
+        torch.testing.assert_close(value, getattr(asked, name))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_remembered_modes_never_give_up_and_every_point_is_evaluated_once(count: int) -> None:
+    """Far out, beside many fresh points of which only the best two go on."""
+    surveyed: list[Tensor] = []
+
+    class Noted(ThreeModes):
+        def curvature(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            surveyed.append(x)
+            return super().curvature(x)
+
+    counted, generator = Counted(Noted()), torch.Generator().manual_seed(5)
+    settings = SamplerSettings(fresh_modes=16, modes=2, climbing_rounds=0, following_rounds=0)
+    far = torch.tensor([[9.0, 9.0], [-9.0, 9.0], [9.0, -9.0]], dtype=torch.float64)[:count]
+    fresh = counted.sample(4, torch.Generator().manual_seed(6))
+    peaks = find_modes(counted, far, settings, generator, fresh)
+    (survivors,) = surveyed
+    assert torch.equal(survivors[:count], far) and len(survivors) == count + 2
+    assert counted.evaluations == count + 16 + 4 + CURVATURE_COST * len(survivors)
+    torch.testing.assert_close(peaks.height, log_target(ThreeModes(), peaks.points))
+
+
 @pytest.mark.parametrize("flat_rounds", [0, 4])
 def test_a_cloud_in_one_mode_still_gives_all_modes_their_share_and_the_evidence(
     flat_rounds: int,

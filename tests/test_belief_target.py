@@ -10,13 +10,15 @@ from contact_scenes import STIFFNESS, flush_corner
 from torch import Tensor
 
 from tpcd.belief.history import history_of
-from tpcd.belief.linearised import linearised_likelihood
+from tpcd.belief.likelihood import effective_setting
+from tpcd.belief.linearised import Linearised, linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
 from tpcd.belief.setting import Merged
 from tpcd.belief.target import ContactTarget
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
+from tpcd.effects.catalogue import find_effect
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
@@ -71,9 +73,9 @@ def test_settled_poses_move_with_theta_as_automatic_derivatives_say(
             readings=history.readings[k : k + 2],
             merged=Merged(**{**merged, "variance": unit**2 * known[None]}),
         )
-        found, _, _ = linearised_likelihood(
+        found = linearised_likelihood(
             prior.shape, vectors, slopes, torch.zeros(8).double(), one, MisfitField(0.0), settings
-        )
+        ).found
         theta = vectors.clone().requires_grad_()
         there = simulate_step(
             scene_from_parameters(prior.shape, Parameters.from_vector(theta)),
@@ -113,7 +115,7 @@ def test_friction_that_is_left_out_moves_nothing() -> None:
     noise = torch.tensor([2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02]).double()
     episode = Episode(commands, poses, STIFFNESS * (poses - commands), STIFFNESS, noise)
     history = history_of(episode)
-    found, _, _ = linearised_likelihood(
+    found = linearised_likelihood(
         prior.shape,
         vectors,
         torch.ones_like(vectors),
@@ -121,7 +123,7 @@ def test_friction_that_is_left_out_moves_nothing() -> None:
         history,
         MisfitField(0.0),
         settings,
-    )
+    ).found
     theta = vectors.clone().requires_grad_()
     scene = scene_from_parameters(prior.shape, Parameters.from_vector(theta))
     asked = (history.poses[0].expand(100, 3), command, STIFFNESS, settings)
@@ -151,6 +153,69 @@ def test_compiled_derivatives_give_the_information_that_differences_give(
     error = torch.linalg.matrix_norm(compiled - differences)
     assert (error / torch.linalg.matrix_norm(differences)).median() < 0.1
     assert (torch.linalg.eigvalsh(compiled)[:, 0] > 0).all()
+
+
+@needs_numba
+@pytest.mark.parametrize("count", [0, 1, 6])
+def test_another_misfit_in_the_same_loops_is_as_by_itself(
+    prior: ParameterPrior, truth_and_episode: tuple[Tensor, Episode], count: int
+) -> None:
+    """Also beside particles that are not finite, and for one or none."""
+    truth, episode = truth_and_episode
+    noise = torch.randn(count, 7, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    vectors, slopes = prior.to_vector_with_slope(truth + 0.3 * noise)
+    sd = torch.linspace(5e-4, 3e-3, count, dtype=torch.float64)
+    sd[4:5] = torch.nan
+    moved = 1.5 * sd
+    moved[2:3] = torch.nan
+
+    def linearised(misfit_sd: Tensor, moved_sd: Tensor | None = None) -> Linearised:
+        history = history_of(episode)
+        arguments = (prior.shape, vectors, slopes, misfit_sd, history, FIELD, StepSettings())
+        return linearised_likelihood(*arguments, moved_sd=moved_sd)
+
+    both = linearised(sd, moved)
+    here, there = linearised(sd).found, linearised(moved).found
+    assert linearised(sd).moved_misfit is None and both.moved_misfit is not None
+    exactly = {"rtol": 0.0, "atol": 0.0, "equal_nan": True}
+    for name in ("total", "field_mean", "field_covariance", "whitened", "log_scale"):
+        own, other = getattr(both.found, name), getattr(both.moved_misfit, name)
+        torch.testing.assert_close(own, getattr(here, name), **exactly)
+        torch.testing.assert_close(other, getattr(there, name), **exactly)
+    torch.testing.assert_close(both.found.slopes, here.slopes, **exactly)
+    assert both.moved_misfit.slopes is None
+    assert both.found.total.isfinite().tolist() == [k != 4 for k in range(count)]
+    assert both.moved_misfit.total.isfinite().tolist() == [k not in (2, 4) for k in range(count)]
+
+
+@needs_numba
+@pytest.mark.parametrize("effects", [(), ("floor_compliance",)])
+def test_derivatives_by_effects_and_the_misfit_s_size_are_differences_of_innovations(
+    truth_and_episode: tuple[Tensor, Episode], effects: tuple[str, ...]
+) -> None:
+    truth, episode = truth_and_episode
+    known = tuple(find_effect(name) for name in effects)
+    prior = make_prior(PolygonShape(builtin_outlines()["mug"]), effects=known)
+    target = ContactTarget(prior, FIELD, StepSettings()).given(history_of(episode))
+    size = prior.dimension + 1
+    noise = torch.randn(5, size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    score = torch.nn.functional.pad(truth, (0, size - len(truth))) + 0.1 * noise
+    vectors, outcome = prior.to_vector(score[:, :-1]), None
+    if known:
+        scene = scene_from_parameters(prior.shape, prior.parameters_of(vectors))
+        given = (scene, target.history, FIELD.sd_of(score[:, -1]), FIELD, target.step)
+        _, outcome = effective_setting(*given, prior.added_of(vectors))
+    found = target._linearised(score)
+    here = target.evaluate(score, innovations=True, outcome=outcome)
+    for entry in range(prior.scene_dimension, size):
+        moved = score.clone()
+        moved[:, entry] += 0.01
+        there = target.evaluate(moved, innovations=True, outcome=outcome)
+        for slopes, name in ((found.slopes, "whitened"), (found.stretch, "log_scale")):
+            expected = (getattr(there, name) - getattr(here, name)) / 0.01
+            steps = expected.shape[1]
+            torch.testing.assert_close(slopes[:, entry, :steps], expected, rtol=1e-6, atol=1e-6)
+            assert float(expected.abs().max()) > 1e-3
 
 
 @pytest.mark.parametrize("power", [1.0, 0.5])

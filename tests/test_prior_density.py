@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -106,3 +108,54 @@ def test_densities_survive_being_stored(name: str, request: pytest.FixtureReques
     again = type(density).from_tensors(density.tensors())
     draws = density.sample(500, torch.Generator().manual_seed(7))
     torch.testing.assert_close(again.log_density(draws), density.log_density(draws))
+
+
+@pytest.fixture
+def overlapping() -> MixtureDensity:
+    """Near its floor three components lie at one place, of which none reaches it alone."""
+    means = torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.0, 0.05], [-0.7, 0.7]]).double()
+    factors = 0.25 * torch.eye(2, dtype=torch.float64).expand(4, 2, 2).contiguous()
+    return MixtureDensity(torch.full((4,), 0.25, dtype=torch.float64), means, factors, -1.0, 0.9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_latent_is_valid_where_the_whole_sum_is_above_the_floor(
+    overlapping: MixtureDensity, dtype: torch.dtype
+) -> None:
+    """Also where no component is by itself."""
+    side = torch.linspace(-1.2, 1.2, 201, dtype=torch.float64).to(dtype)
+    latent = torch.cartesian_prod(side, side).reshape(201, 201, 2)
+    expected = (latent.abs() <= 1).all(-1) & (overlapping.raw_log_density(latent) >= -1.0)
+    assert torch.equal(overlapping.valid(latent), expected)
+    assert torch.equal(overlapping.log_density(latent) > -torch.inf, expected)
+    parts, _, _ = overlapping._parts(latent)
+    alone = parts.amax(-1).reshape(201, 201) >= -1.0
+    assert int((expected & alone).sum()) > 100 and int((expected & ~alone).sum()) > 100
+    # Each latent for itself, and none at all.
+    few = latent[::20, ::20].reshape(-1, 2)
+    each = torch.stack([overlapping.valid(one) for one in few])
+    assert torch.equal(overlapping.valid(few), each)
+    assert overlapping.valid(latent[:0]).shape == (0, 201)
+
+
+def test_absurd_latents_leave_their_neighbours_as_they_are(overlapping: MixtureDensity) -> None:
+    latent = torch.zeros(5, 2, dtype=torch.float64)
+    latent[1], latent[2, 0], latent[3] = torch.nan, torch.inf, 1e200
+    assert overlapping.valid(latent).tolist() == [True, False, False, False, True]
+    assert overlapping.valid(latent[1:4]).tolist() == [False] * 3
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))])
+def test_a_mixture_that_has_been_used_can_be_copied(mixture: MixtureDensity, copied) -> None:
+    draws = mixture.sample(50, torch.Generator().manual_seed(9))
+    assert torch.equal(copied(mixture).log_density(draws), mixture.log_density(draws))
+
+
+def test_a_mixture_that_was_used_in_inference_mode_has_derivatives_after(
+    mixture: MixtureDensity,
+) -> None:
+    latent = mixture.means.clone()
+    with torch.inference_mode():
+        assert mixture.valid(latent).all()
+    (gradient,) = torch.autograd.grad(mixture.log_density(latent.requires_grad_()).sum(), latent)
+    torch.testing.assert_close(gradient, mixture.curvature(latent.detach())[0])

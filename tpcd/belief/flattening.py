@@ -48,7 +48,8 @@ FAR_OFF = 3.0
 LARGEST_MISFIT = 0.1
 """The map takes no misfit to be larger [m]: beyond, nothing is left of the readings anyway."""
 _OUTLINES_AT_ONCE = 128
-"""Outlines whose points are measured along all normals at once, in fast memory."""
+"""Outlines whose points are measured along all normals at once, in fast memory: 64 to 512 take
+half of the time of 1500."""
 _TOUCHES_AT_ONCE = 30_000
 """Points times touches that are held in memory at once, for all points of an outline."""
 

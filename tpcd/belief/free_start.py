@@ -67,9 +67,12 @@ class StartGaps:
 
     def log_free_before(self, field: MisfitField, sd: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """The same before any data: no more than that can all of them together be likely."""
-        known, _ = field.basis(self.angle)
-        of_field = (known**2).sum(-1) + field.uncovered(known) if field.bumps else 0 * self.angle
-        return _log_free(self.gap, self.variance + (sd**2)[:, None, None] * of_field[:, None])
+        variance = self.variance
+        if field.bumps:
+            known, _ = field.basis(self.angle)
+            of_field = (known**2).sum(-1) + field.uncovered(known)
+            variance = variance + (sd**2)[:, None, None] * of_field[:, None]
+        return _log_free(self.gap, variance)
 
 
 def _log_free(gap: Tensor, variance: Tensor) -> Tensor:

@@ -78,7 +78,7 @@ class History:
     @property
     def read(self) -> Bool[Tensor, " rows"]:
         """Rows whose parity counts: those at an end of a transition that counts."""
-        ends = torch.zeros(len(self.readings), dtype=torch.bool)
+        ends = torch.zeros(len(self.readings), dtype=torch.bool, device=self.used.device)
         if not self.parity_counts:
             return ends
         ends[1:] |= self.used
@@ -88,7 +88,7 @@ class History:
     @property
     def rows(self) -> Rows:
         """The rows as effects see them; every recording is a run of its own."""
-        follows = torch.arange(len(self.readings))
+        follows = torch.arange(len(self.readings), device=self.seams.device)
         follows[1:] -= self.seams.logical_not().long()
         return sequence(self.readings[:, :3], follows)
 

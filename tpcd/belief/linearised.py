@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,7 @@ def linearised_likelihood(
     moved_sd: Float[Tensor, " m"] | None = None,
 ) -> Linearised:
     """The likelihood with the derivatives of its innovations by d coordinates, in compiled loops,
-    and that with a misfit of `moved_sd` [m] instead, in the same loops.
+    and, without derivatives, that with a misfit of `moved_sd` [m] instead.
 
     `vectors` are theta, and `slopes` the derivatives of each entry by its own coordinate. The
     scene moves by differences, the settled poses by the derivatives of the rest equations,
@@ -84,5 +85,7 @@ def linearised_likelihood(
     found = compiled_filter(
         points_ee, setting, sd, field, settings, innovations=True, by_theta=SceneSlopes(*parts)
     )
-    moved_misfit = None if moved_sd is None else found[torch.arange(m, 2 * m)]
+    if moved_sd is None:
+        return Linearised(found, None, outcome)
+    moved_misfit = replace(found[torch.arange(m, 2 * m)], slopes=None)
     return Linearised(found[torch.arange(m)], moved_misfit, outcome)

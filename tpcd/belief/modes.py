@@ -79,8 +79,8 @@ def find_modes(
     points = torch.cat((remembered, target.scatter(settings.fresh_modes, generator)))
     start = set_out(target, points if fresh is None else torch.cat((points, fresh)))
     order = torch.arange(len(start.points))
-    known, new = start[order[: len(remembered)]], start[order[len(remembered) :]]
-    start = known.beside(climb_with_the_best(target, new, settings))
+    kept_on, new = start[order[: len(remembered)]], start[order[len(remembered) :]]
+    start = kept_on.beside(climb_with_the_best(target, new, settings))
     arrived = climb(target, start, settings.following_rounds).surveyed(target)
     points, information = arrived.points, arrived.information
     kept: list[int] = []

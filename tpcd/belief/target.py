@@ -127,7 +127,7 @@ class ContactTarget:
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE
             there = moved_misfit
-            if entry < s - 1:
+            if entry < s - 1:  # The last is the size of the misfit.
                 there = self.evaluate(moved, innovations=True, outcome=outcome)
             parity, parity_scale = self.parity(moved)
             found = torch.cat((_known(there.whitened), parity), dim=1)

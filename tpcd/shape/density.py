@@ -140,15 +140,17 @@ class MixtureDensity:
 
     @cached_property
     def _forms(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Log (k) of each weighted component at zero, P m and the precision P."""
+        """Log density (k) of each weighted component at zero, P m (k, z) and P (k, z, z)."""
         means, factors = self.means, self.factors
-        precision = torch.cholesky_inverse(factors)
-        linear = (precision @ means[..., None])[..., 0]
-        log_scale = (
-            self.weights.log()
-            - factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-            - 0.5 * (means.shape[-1] * math.log(2 * math.pi) + (linear * means).sum(-1))
-        )
+        # They are kept, and what is made in inference mode could not be differentiated by later.
+        with torch.inference_mode(False):
+            precision = torch.cholesky_inverse(factors)
+            linear = (precision @ means[..., None])[..., 0]
+            log_scale = (
+                self.weights.log()
+                - factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+                - 0.5 * (means.shape[-1] * math.log(2 * math.pi) + (linear * means).sum(-1))
+            )
         return log_scale, linear, precision
 
     def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:

@@ -46,6 +46,7 @@ def predict_episodes(config: Predict) -> None:
     from tpcd.belief.augmented import with_model
     from tpcd.belief.storage import load_belief
     from tpcd.commands.kept_model import model_of
+    from tpcd.commands.plausibility import check_start_of
     from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
@@ -81,6 +82,7 @@ def predict_episodes(config: Predict) -> None:
                 f"{belief.stiffness.tolist()}",
                 "predict episodes recorded with the same controller",
             )
+        check_start_of(episode, belief)
     generator = torch.Generator().manual_seed(config.seed)
     if config.model is not None:
         try:

@@ -60,7 +60,9 @@ def test_the_floor_under_an_unknown_object_is_found(world: Path) -> None:
     assert abs(floor["mean"] - truth["floor_height"]) < 6 * floor["std"] + 1e-3
 
 
-@pytest.mark.parametrize("options", [(), ("--rollout",), ("--of", "true")], ids=str)
+@pytest.mark.parametrize(
+    "options", [(), ("--rollout",), ("--of", "true"), ("--rollout", "--of", "true")], ids=str
+)
 def test_predictions_have_a_row_for_each_step(
     world: Path, tmp_path: Path, options: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -71,12 +71,14 @@ def test_estimate_refuses(world, tmp_path, monkeypatch, capsys, case) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def changed_episode(world: Path, folder: Path, row: int, values: dict[str, float]) -> Path:
-    """A copy of the exploration with other values in one row."""
-    shutil.copy(world / "explore.yaml", folder / "changed.yaml")
-    lines = [line.split(",") for line in (world / "explore.csv").read_text().splitlines()]
-    for name, value in values.items():
-        lines[row + 1][lines[0].index(name)] = repr(value)
+def changed_episode(
+    world: Path, folder: Path, row: int, values: dict[str, float], name: str = "explore"
+) -> Path:
+    """A copy of a recording with other values in one row."""
+    shutil.copy(world / f"{name}.yaml", folder / "changed.yaml")
+    lines = [line.split(",") for line in (world / f"{name}.csv").read_text().splitlines()]
+    for column, value in values.items():
+        lines[row + 1][lines[0].index(column)] = repr(value)
     path = folder / "changed.csv"
     path.write_text("\n".join(",".join(line) for line in lines) + "\n")
     return path
@@ -159,6 +161,14 @@ def test_predict_refuses(world, monkeypatch, capsys, case) -> None:
     assert expected in refused(capsys, world, "predict", run, "test.csv", *words)
 
 
+def test_predict_refuses_a_start_that_no_particle_allows(world, tmp_path, capsys) -> None:
+    path = changed_episode(world, tmp_path, 0, {"z": -0.2, "u_z": -0.2}, "test")
+    arguments = (str(world / "run"), str(path), "--out", str(tmp_path / "p.csv"))
+    line = refused(capsys, tmp_path, "predict", *arguments)
+    assert f"{path}: row 0" in line and "particles of the belief" in line
+    assert "mm inside the floor" in line and "in the same frame" in line
+
+
 @pytest.mark.parametrize("part", ["belief.json", "belief.safetensors"])
 @pytest.mark.parametrize("length", [0, 100])
 def test_a_belief_that_was_cut_off_is_named(world, tmp_path, capsys, part, length) -> None:
@@ -174,7 +184,8 @@ def test_a_belief_or_prior_of_another_version_is_named(world, tmp_path, capsys) 
     for path in (run / "belief.json", prior / "card.json"):
         path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": 99}))
     arguments = (str(run), str(world / "test.csv"), "--out", str(tmp_path / "p.csv"))
-    assert "version 99, expected" in refused(capsys, tmp_path, "predict", *arguments)
+    line = refused(capsys, tmp_path, "predict", *arguments)
+    assert "version 99, expected" in line and "estimate again" in line
     arguments = (*estimate_arguments(world, tmp_path / "new"), "--prior", str(prior))
     assert "version 99, this program" in refused(capsys, tmp_path, "estimate", *arguments)
 

@@ -47,5 +47,5 @@ def test_nothing_is_left_to_compile_for_an_estimate() -> None:
 
 def test_without_numba_there_is_nothing_to_compile(monkeypatch, capsys) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert compile_ahead.main() == 0
+    compile_ahead.compile_ahead(compile_ahead.CompileAhead())
     assert "nothing to compile" in capsys.readouterr().out

@@ -143,6 +143,10 @@ BAD_TABLES = {
     "repeated step": ([ROWS[0], ROWS[1], ROWS[1]], ["row 2", "found 1, expected 2 (repeated)"]),
     "backwards": ([ROWS[0], ROWS[1], ROWS[0]], ["row 2", "found 0", "backwards"]),
     "missing row": ([ROWS[0], ROWS[2]], ["row 1", "found 2, expected 1 (rows missing)"]),
+    "swapped rows": (
+        [ROWS[0], ROWS[2], ROWS[1]],
+        ["row 1", "found 2, expected 1 (steps out of order)", "sort the rows"],
+    ),
     "no start row": ([ROWS[1], ROWS[2]], ["row 0", "found 1, expected 0", "start pose"]),
     "fractional step": (edit(1, "step", "0.5"), ["row 1", "not a whole number"]),
     "jump": (edit(2, "u_x", "0.8"), ["row 2 (line 4)", "u_x", "jumps by 0.8 m", "0.5 m"]),
@@ -326,6 +330,13 @@ def test_an_inverted_wrench_is_a_warning_and_a_right_one_is_none(tmp_path):
     assert "F_z looks inverted" in warning
     (warning,) = check_episode(replace(episode, stiffness=stiffness * 1000))
     assert "check the stiffness" in warning
+    degrees = torch.tensor([1, 1, 180 / torch.pi], dtype=torch.float64)
+    turned = episode.poses.clone()
+    turned[1:, 2] = 0.02
+    told = replace(episode, poses=turned, wrenches=stiffness * (turned - commands) + noise)
+    assert check_episode(told) == []
+    (warning,) = check_episode(replace(told, poses=turned * degrees))
+    assert "as where angles are in degrees" in warning and "pi / 180" in warning
     free = replace(episode, poses=commands, wrenches=noise)
     assert "no step shows contact" in check_episode(free)[0]
     for factor in (1e-3, 1e-2):

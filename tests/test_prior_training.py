@@ -18,6 +18,7 @@ from training.evaluate import outline_errors
 from training.outlines import data_hash, mirrored, suitable, training_outlines
 from training.rates import cosine_rate, split_optimizers
 from training.train import Training, train_prior
+from training.validity import TrainingError
 
 CONFIGS = Path(__file__).resolve().parents[1] / "training" / "configs"
 NAMES = ("drink_can", "banana", "juice_carton")
@@ -109,6 +110,39 @@ def test_resuming_from_nothing_is_refused_in_one_line(
     message = capsys.readouterr().err.strip()
     assert "last.ckpt" in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], "is not empty; name a new folder or pass --overwrite"),
+        (["--out={0}/config.yaml"], "config.yaml is a file; name another folder"),
+        (["--out={1}", "--export={0}/config.yaml"], "config.yaml: is a file"),
+        (["--out={1}", "--export={0}/builtin-z2"], "is not empty; name a new folder"),
+    ],
+)
+def test_nothing_is_trained_over_what_is_there(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options, expected: str
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    options = [option.format(run, tmp_path / "new") for option in options] or [f"--out={run}"]
+    assert call(*ARGUMENTS, *options) == 2
+    message = capsys.readouterr().err.strip()
+    assert expected in message and "\n" not in message
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_training_that_fails_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failing(*arguments):
+        raise TrainingError("the trained network decodes to nothing")
+
+    monkeypatch.setattr("training.run.prepare", failing)
+    assert call(*ARGUMENTS, f"--out={tmp_path / 'x'}") == 2
+    assert "decodes to nothing" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_unknown_outlines_are_refused_in_one_line(

@@ -7,8 +7,10 @@ the first command that needs them waits for that, in the middle of its work.
 from __future__ import annotations
 
 import importlib.util
-import sys
 import time
+from dataclasses import dataclass
+
+from tpcd.cli import run
 
 
 def compile_loops() -> None:
@@ -34,16 +36,20 @@ def compile_loops() -> None:
     )
 
 
-def main() -> int:
+@dataclass(frozen=True)
+class CompileAhead:
+    """There is nothing to set."""
+
+
+def compile_ahead(config: CompileAhead) -> None:
     """Compile what is not compiled yet, and say how long that took."""
     if importlib.util.find_spec("numba") is None:
         print("numba is not installed (extra `fast`): there is nothing to compile")
-        return 0
+        return
     began = time.perf_counter()
     compile_loops()
     print(f"the compiled loops are ready ({time.perf_counter() - began:.0f} s)")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(compile_ahead, CompileAhead)

@@ -104,6 +104,20 @@ def check_target(
     _check_place(path.parent)
 
 
+def check_folder(path: str | Path, overwrite: bool = False) -> None:
+    """Refuse a folder that could not be written in the end, before the work begins.
+
+    Raises `RunError` where it is a file, holds something and `overwrite` is false, or lies where
+    nothing can be written.
+    """
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise RunError(folder, "is a file", "name a folder")
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise RunError(folder, "is not empty", "name a new folder or pass --overwrite")
+    _check_place(folder)
+
+
 def _holds_run(folder: Path, overwrite: bool) -> bool:
     """Whether an earlier run is to be replaced; `RunError` where nothing may be put there."""
     if folder.exists() and not folder.is_dir():

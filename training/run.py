@@ -12,13 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 from lightning import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.tensorboard import SummaryWriter
 
-from tpcd.errors import RunError
 from tpcd.shape.checkpoint import load_prior, save_prior
 from tpcd.shape.deepsdf import DeepSDFNetwork
 from tpcd.shape.protocol import Misfit
@@ -30,6 +28,8 @@ from training.monitor import ErrorMonitor, log_figures
 from training.unseen import measure_unseen, unseen_outlines
 from training.validity import fit_mask, fit_truncated_mixture
 
+CHECKPOINT = "last.ckpt"
+"""Lightning's, in the run folder, from which a stopped training goes on."""
 PACKAGES = ("torch", "lightning", "numpy", "scipy", "shapely", "contourpy", "safetensors")
 ATTRIBUTION = (
     "Trained on outlines derived from the YCB Object and Model Set (B. Calli et al., IEEE "
@@ -41,22 +41,17 @@ ATTRIBUTION = (
 def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False) -> Path:
     """Train, measure and export a prior; returns the checkpoint folder.
 
+    `out` is an opened run folder; with `resume` it holds a checkpoint to go on from.
+
     Raises:
-        RunError: `resume` without anything to resume from.
         FileError: the outlines are not there.
         TrainingError: the trained network decodes to nothing.
     """
-    last = out / "last.ckpt"
-    if resume and not last.is_file():
-        raise RunError(out, "holds no last.ckpt to resume from", "leave out --resume")
     torch.set_num_threads(config.optim.threads)
     began, began_cpu = time.perf_counter(), time.process_time()
     prepared = prepare(config)
-    out.mkdir(parents=True, exist_ok=True)
-    resolved = yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
-    (out / "config.yaml").write_text(resolved, encoding="utf-8")
     module = PriorModule(prepared, config)
-    _fit(module, prepared, config, out, last if resume else None)
+    _fit(module, prepared, config, out, out / CHECKPOINT if resume else None)
     seconds = {
         "training_wall_seconds": round(time.perf_counter() - began, 1),
         "training_cpu_seconds": round(time.process_time() - began_cpu, 1),
@@ -129,7 +124,10 @@ def _fit(
     warnings.filterwarnings("ignore", category=UserWarning, module="lightning")
     warnings.filterwarnings("ignore", category=FutureWarning, module="lightning")
     keep = ModelCheckpoint(
-        dirpath=out, filename="last", every_n_train_steps=200, enable_version_counter=False
+        dirpath=out,
+        filename=Path(CHECKPOINT).stem,
+        every_n_train_steps=200,
+        enable_version_counter=False,
     )
     trainer = Trainer(
         accelerator="cpu",

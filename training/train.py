@@ -7,10 +7,13 @@ configuration) and, at the end, the released prior: safetensors and a JSON card.
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from tpcd.cli import run
+from tpcd.errors import RunError
+from tpcd.results import check_folder, continue_run, run_folder
 from training.config import TrainingConfig
 
 
@@ -28,19 +31,31 @@ class Training(TrainingConfig):
     """Checkpoint folder of the finished prior; by default OUT/NAME."""
     resume: bool = False
     """Go on from the last checkpoint in the run folder."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder, and an earlier prior in that of the export."""
 
 
 def train_prior(config: Training) -> None:
     """Train a shape prior, measure it and write it with its card."""
     # torch and Lightning take seconds to import; --help should not wait for them.
-    from training.run import train
+    from training.run import CHECKPOINT, train
 
     settings = {field.name: getattr(config, field.name) for field in fields(TrainingConfig)}
     out = config.out or Path("runs") / config.name
+    export = config.export or out / config.name
+    again = config.overwrite or config.resume or config.export is None
+    check_folder(export, again)
     began, began_cpu = time.perf_counter(), time.process_time()
-    folder = train(
-        TrainingConfig(**settings), out, config.export or out / config.name, config.resume
-    )
+    if config.resume:
+        if not (out / CHECKPOINT).is_file():
+            raise RunError(out, f"holds no {CHECKPOINT} to resume from", "leave out --resume")
+        opened = nullcontext(continue_run(out, config, [field.name for field in fields(config)]))
+    else:
+        opened = run_folder(
+            out, "python -m training.train", config, config.overwrite, resumable=CHECKPOINT
+        )
+    with opened:
+        folder = train(TrainingConfig(**settings), out, export, config.resume)
     wall, cpu = time.perf_counter() - began, time.process_time() - began_cpu
     print(f"prior written to {folder} (measuring included: {wall:.0f} s, {cpu:.0f} CPU s)")
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tpcd.belief.paper import PAPER_STEP
 from tpcd.contact import ContactScene, column_scene, place_points, scene_from_parameters
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES, Parameters
 from tpcd.planar import wrap_angle
@@ -26,7 +27,6 @@ STIFFNESS = (100.0, 100.0, 50.0)
 """Of the impedance [N/m, N/m, N·m/rad]."""
 COVARIANCE = (30.0, 30.0, 0.3, 1e-4, 1e-4, 0.002)
 """Diagonal of the paper's R for wrench and pose."""
-PAPER_STEP = StepSettings(friction="anitescu", substeps=1)
 QP_ROWS = 16
 """Rows of the contact problems whose solution is timed alone."""
 Timer = Callable[[Callable[[], Any]], dict[str, float]]

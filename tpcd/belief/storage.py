@@ -71,7 +71,11 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     found = card if isinstance(card, dict) else {}
     if found.get("format") != "tpcd-belief" or found.get("format_version") != FORMAT_VERSION:
         text = f"{found.get('format')} version {found.get('format_version')}"
-        raise RunError(path, f"holds {text}, expected tpcd-belief version {FORMAT_VERSION}")
+        raise RunError(
+            path,
+            f"holds {text}, expected tpcd-belief version {FORMAT_VERSION}",
+            "estimate again from the episode, or use the tpcd that wrote it",
+        )
     try:
         prior, weights = card["prior"], card["prior_sha256"]
         misfit, step = MisfitField(**card["misfit"]), StepSettings(**card["step"])

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import torch
 
+from tpcd.belief.belief import Belief
 from tpcd.belief.prior import make_prior
 from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.episode import Episode
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
+from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 
 DRAWS = 1000
@@ -28,13 +30,29 @@ def check_start_pose(episode: Episode, shape: Shape) -> None:
     `EpisodeError` that says how deep the shallowest draw is.
     """
     prior = make_prior(shape, episode.priors)
+    draws = prior.sample(DRAWS, torch.Generator().manual_seed(0))
+    remedy = "check the frame of the poses, or give floor_height and wall_position under priors"
+    _refuse_inside(episode, shape, prior.to_parameters(draws), "draws from the priors", remedy)
+
+
+def check_start_of(episode: Episode, belief: Belief) -> None:
+    """Refuse an episode whose start pose is inside floor or wall for every particle of a belief,
+    as `check_start_pose` does before there is one."""
+    remedy = "predict episodes of the scene that the belief was learnt in, in the same frame"
+    _refuse_inside(
+        episode, belief.prior.shape, belief.parameters, "particles of the belief", remedy
+    )
+
+
+def _refuse_inside(
+    episode: Episode, shape: Shape, parameters: Parameters, what: str, remedy: str
+) -> None:
     with torch.no_grad():
-        draws = prior.sample(DRAWS, torch.Generator().manual_seed(0))
-        parameters = prior.to_parameters(draws)
         scene = scene_from_parameters(
             shape, replace(parameters, latent=parameters.latent.float())
         ).double()
-        pose = episode.poses[0].expand(DRAWS, 3)
+        count = len(parameters.scale)
+        pose = episode.poses[0].expand(count, 3)
         gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, pose)
     shallowest, terrain = gaps.amin(-1).min(-1)
     best = int(shallowest.argmax())
@@ -47,7 +65,7 @@ def check_start_pose(episode: Episode, shape: Shape) -> None:
     raise EpisodeError(
         path,
         f"{row}: the start pose ({x:.4g}, {z:.4g}, {angle:.4g}) is at least"
-        f" {depth:.0f} mm inside the {where} for all of {DRAWS} draws from the priors, expected a"
+        f" {depth:.0f} mm inside the {where} for all of {count} {what}, expected a"
         " pose free of contact",
-        "check the frame of the poses, or give floor_height and wall_position under priors",
+        remedy,
     )

@@ -23,7 +23,7 @@ from tpcd.data.episode import Episode
 from tpcd.data.files import write_together
 from tpcd.data.table import encode_table
 from tpcd.planar import wrap_angle
-from tpcd.predict import ContactPredictor
+from tpcd.predict import LEAST_STD, ContactPredictor
 from tpcd.prediction import CHANNELS, Prediction
 from tpcd.results import RESULTS_FILE
 
@@ -100,9 +100,10 @@ def rollout_rows(
     draws = predictor.rollout(
         episode.poses[0], episode.commands[1:], generator, samples=ROLLOUT_SAMPLES
     )
-    if of == "measured":
-        noise = torch.randn(draws.shape, generator=generator, dtype=draws.dtype)
-        draws = draws + noise * episode.sensor_std
+    # What the numerics leave is part of every prediction, so that free rows have a width.
+    least = LEAST_STD * torch.cat((torch.ones_like(episode.stiffness), episode.stiffness))
+    added = torch.hypot(least, episode.sensor_std) if of == "measured" else least
+    draws = draws + torch.randn(draws.shape, generator=generator, dtype=draws.dtype) * added
     rows = measured_rows(reference or episode)[1:]
     levels = torch.tensor([0.05, 0.95], dtype=draws.dtype)
     low, high = torch.quantile(draws, levels, dim=0)
@@ -111,7 +112,7 @@ def rollout_rows(
         std=draws.std(0),
         low=low,
         high=high,
-        transform=(draws < rows).double().mean(0),
+        transform=(prediction_error(rows, draws) < 0).double().mean(0),
     )
 
 
@@ -120,10 +121,12 @@ def measured_rows(episode: Episode) -> Float[Tensor, "n 6"]:
     return torch.cat((episode.poses, episode.wrenches), dim=-1)
 
 
-def prediction_error(rows: Float[Tensor, "n 6"], mean: Float[Tensor, "n 6"]) -> Tensor:
+def prediction_error(
+    rows: Float[Tensor, "n 6"], mean: Float[Tensor, "*batch n 6"]
+) -> Float[Tensor, "*batch n 6"]:
     """Predicted minus actual for each row and channel, angles wrapped."""
     error = mean - rows
-    return torch.cat((error[:, :2], wrap_angle(error[:, 2:3]), error[:, 3:]), dim=-1)
+    return torch.cat((error[..., :2], wrap_angle(error[..., 2:3]), error[..., 3:]), dim=-1)
 
 
 def score_rows(predicted: PredictedRows, rows: Float[Tensor, "n 6"]) -> list[dict[str, Any]]:

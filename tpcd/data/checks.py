@@ -52,6 +52,8 @@ def check_steps(path: Path, steps: np.ndarray) -> None:
             problem, remedy = f"{where} (repeated)", "keep one row for each step"
         elif row and step < steps[row - 1]:
             problem, remedy = f"{where} (steps go backwards)", "sort the rows by step"
+        elif row in steps[row:]:
+            problem, remedy = f"{where} (steps out of order)", "sort the rows by step"
         elif not float(step).is_integer():
             problem, remedy = f"{where} (not a whole number)", "number the rows 0, 1, 2, …"
         elif row:
@@ -171,6 +173,11 @@ def check_episode(episode: Episode) -> list[str]:
             continue
         if slope < INVERTED:
             warnings.append(inverted_sentence(name, slope))
+        elif name == "tau" and 0.5 < math.degrees(slope) < 2.0:
+            warnings.append(
+                f"tau is {slope:.2g} times K (phi - u_phi), as where angles are in degrees;"
+                " expected rad: multiply u_phi and phi by pi / 180"
+            )
         elif not 0.5 < slope < 2.0:
             warnings.append(
                 f"{name} is {slope:.2g} times K (pose - command), expected about 1; check the"

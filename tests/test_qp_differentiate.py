@@ -139,6 +139,22 @@ def test_padded_rows_get_zero_gradient_and_change_none():
     assert not (gradients[0][2][~problem.row_mask] != 0).any()
 
 
+@pytest.mark.parametrize("engine", ["auto", "native"])
+def test_gradients_are_exact_beside_padded_rows(engine):
+    """To second order too; each element has another number of rows, at other places."""
+    problem = generic(2, 6, 3)
+    mask = torch.tensor(
+        [[True, False, True, True, False, True], [False, True, True, True, True, False]]
+    )
+    assert solve(replace(problem, row_mask=mask)).active.any(-1).all()
+
+    def answer(hessian, target, rows, offsets, compliance):
+        solution = solve(ContactQP(hessian, target, rows, offsets, compliance, mask), engine)
+        return solution.motion, solution.multipliers
+
+    check(answer, *problem.tensors[:5])
+
+
 def test_elements_without_an_answer_get_zero_gradient():
     problem = generic(4, 5, 6)
     target = problem.target.clone()

@@ -93,7 +93,27 @@ def evaluate_physical(config: Physical) -> None:
     for estimator in ours:
         rows.append(_mean(estimator, [row for row in rows[1:] if row["estimator"] == estimator]))
     print(format_table(rows[-len(ours) :]))
+    log_errors(rows, folder)
     write_results(folder, rows, seeds=[config.seed], kind="emulated, not measured on a robot")
+
+
+def log_errors(rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    """The table for TensorBoard, and its errors as a figure."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    from tpcd.figures.quality import error_bars
+    from tpcd.figures.sinks import save_figure
+    from tpcd.results import format_table
+
+    labels = {"x_mm": "error of x [mm]", "z_mm": "error of z [mm]", "F_x_N": "error of F_x [N]"}
+    with SummaryWriter(folder / "tensorboard") as writer:
+        figure = error_bars(rows, labels, group="estimator")
+        save_figure(figure, folder / "figures", "errors", writer)
+        for row in rows:
+            for key, value in row.items():
+                if isinstance(value, float) and key != "tiles":
+                    writer.add_scalar(f"{key}/{row['estimator']}/{row['object']}", value)
+        writer.add_text("table", f"```\n{format_table(rows)}\n```")
 
 
 def _rows(

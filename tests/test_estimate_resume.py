@@ -73,6 +73,9 @@ def test_a_stopped_estimation_goes_on_to_the_same_belief(
     torch.testing.assert_close(load_belief(folder).vectors, whole.vectors, rtol=0, atol=0)
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert "NaN" not in (folder / "steps.jsonl").read_text()
+    for row in rows:
+        assert row["distinct"] > 1 and (row["log_evidence_std"] is None) == (kind == "paper")
 
 
 def test_a_state_of_other_data_or_version_or_cut_off_is_refused(

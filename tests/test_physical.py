@@ -30,6 +30,8 @@ def test_one_object_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "paper, Real" in capsys.readouterr().out
     results = json.loads((config.out / "results.json").read_text())
     assert "emulated" in results["kind"]
+    assert (config.out / "figures" / "errors.png").stat().st_size > 5000
+    assert len(list((config.out / "tensorboard").glob("events*"))) == 1
     rows = {row["estimator"]: row for row in results["table"] if row["object"] == "mug, emulated"}
     assert set(rows) == {"paper's filter", "ours, rigid tiles"}
     assert all(0 < row["x_mm"] < 50 for row in rows.values())

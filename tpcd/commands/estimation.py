@@ -206,20 +206,29 @@ def step_row(step: EstimationStep, learnt: str | None = None) -> dict[str, Any]:
         "seconds": step.seconds,
         "learnt_most": learnt,
         "effective_sample_size": float(step.info.effective_sample_size),
-        "tail_shape": step.info.tail_shape if math.isfinite(step.info.tail_shape) else None,
-        "log_evidence": belief.log_evidence,
+        "tail_shape": _known(step.info.tail_shape),
+        "draws": step.info.draws,
+        "distinct": step.info.distinct,
+        "log_evidence": _known(belief.log_evidence),
+        "log_evidence_std": _known(belief.log_evidence_std),
         "mean": belief.mean().tolist(),
         "low": belief.quantile(0.05).tolist(),
         "high": belief.quantile(0.95).tolist(),
     }
 
 
+def _known(value: float) -> float | None:
+    """The value, None where the estimator has none: JSON has no NaN."""
+    return value if math.isfinite(value) else None
+
+
 def _log_scalars(writer: Any, row: dict[str, Any], step: EstimationStep) -> None:
     writer.add_scalar("sampler/effective_sample_size", row["effective_sample_size"], step.index)
     writer.add_scalar("sampler/seconds", step.seconds, step.index)
-    if row["tail_shape"] is not None:
-        writer.add_scalar("sampler/tail_shape", row["tail_shape"], step.index)
-    writer.add_scalar("sampler/log_evidence", row["log_evidence"], step.index)
+    writer.add_scalar("sampler/distinct", row["distinct"], step.index)
+    for name in ("tail_shape", "log_evidence"):
+        if row[name] is not None:
+            writer.add_scalar(f"sampler/{name}", row[name], step.index)
     for name, mean, std in zip(
         step.belief.prior.names, step.belief.mean(), step.belief.std(), strict=True
     ):

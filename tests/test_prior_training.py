@@ -103,6 +103,14 @@ def test_a_run_resumes_where_it_stopped(run: Path, capsys: pytest.CaptureFixture
     assert load_prior(run / "builtin-z2").card["configuration"]["optim"]["steps"] == 230
 
 
+def test_a_run_of_another_network_is_not_resumed(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(*ARGUMENTS, "--network.width=32", f"--out={run}", "--resume") == 2
+    message = capsys.readouterr().err.strip()
+    assert "holds a run with another network" in message and "\n" not in message
+
+
 def test_resuming_from_nothing_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

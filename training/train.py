@@ -49,7 +49,8 @@ def train_prior(config: Training) -> None:
     if config.resume:
         if not (out / CHECKPOINT).is_file():
             raise RunError(out, f"holds no {CHECKPOINT} to resume from", "leave out --resume")
-        opened = nullcontext(continue_run(out, config, [field.name for field in fields(config)]))
+        may_change = [name for name in vars(config) if name not in ("data", "layout", "network")]
+        opened = nullcontext(continue_run(out, config, may_change))
     else:
         opened = run_folder(
             out, "python -m training.train", config, config.overwrite, resumable=CHECKPOINT

@@ -47,7 +47,7 @@ class HistoryLikelihood:
     slopes: Float[Tensor, "m d n 3"] | None = None
     steps: Steps | None = None
 
-    def __getitem__(self, index: Tensor) -> HistoryLikelihood:
+    def __getitem__(self, index: Tensor | slice) -> HistoryLikelihood:
         """Of some particles, without how their transitions settled."""
         values = {name: v[index] for name, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **values, steps=None)

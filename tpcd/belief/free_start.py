@@ -76,6 +76,8 @@ class StartGaps:
 
 
 def _log_free(gap: Tensor, variance: Tensor) -> Tensor:
+    """Log probability (m) that gaps (m, f, t) of a variance (m, f, t) [m, m^2] are open; the least
+    likely row f counts."""
     total = torch.special.log_ndtr(gap / variance.sqrt()).amin(-2).sum(-1)
     return torch.where(torch.isfinite(total), total, -torch.inf)
 

@@ -87,5 +87,5 @@ def linearised_likelihood(
     )
     if moved_sd is None:
         return Linearised(found, None, outcome)
-    moved_misfit = replace(found[torch.arange(m, 2 * m)], slopes=None)
-    return Linearised(found[torch.arange(m)], moved_misfit, outcome)
+    moved_misfit = replace(found[m:], slopes=None)
+    return Linearised(found[:m], moved_misfit, outcome)

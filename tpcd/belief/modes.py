@@ -31,7 +31,7 @@ class Climbers:
     information: Float[Tensor, "k d d"]
     known: Bool[Tensor, " k"]
 
-    def __getitem__(self, index: Tensor) -> Climbers:
+    def __getitem__(self, index: Tensor | slice) -> Climbers:
         return Climbers(**{name: value[index] for name, value in vars(self).items()})
 
     def beside(self, others: Climbers) -> Climbers:
@@ -78,8 +78,7 @@ def find_modes(
     those from all over the prior."""
     points = torch.cat((remembered, target.scatter(settings.fresh_modes, generator)))
     start = set_out(target, points if fresh is None else torch.cat((points, fresh)))
-    order = torch.arange(len(start.points))
-    kept_on, new = start[order[: len(remembered)]], start[order[len(remembered) :]]
+    kept_on, new = start[: len(remembered)], start[len(remembered) :]
     start = kept_on.beside(climb_with_the_best(target, new, settings))
     arrived = climb(target, start, settings.following_rounds).surveyed(target)
     points, information = arrived.points, arrived.information

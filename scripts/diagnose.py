@@ -23,7 +23,7 @@ class Diagnose:
     model: Path | None = None
     """Model file with effects that are already known."""
     candidates: tuple[Path, ...] = ()
-    """Python files with effects of your own to try besides the catalogue (docs/effects.md)."""
+    """Python files with effects of your own to try too (tpcd/effects/README.md)."""
     fresh: tuple[Path, ...] = ()
     """Episodes of the same set-up that only measure the gap; without them blocks are held out."""
     seed: int = 0

@@ -20,7 +20,7 @@ class Estimate:
     out: Path
     """Folder for the results; a stopped run in it goes on with --resume."""
     model: Path | None = None
-    """Model file with effects to estimate too, such as diagnose writes (docs/effects.md)."""
+    """Model file with effects to estimate too, such as diagnose writes (tpcd/effects/README.md)."""
     estimator: Literal["default", "paper"] = "default"
     """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
     particles: int = 700

@@ -1,4 +1,4 @@
-"""Turn a recording from elsewhere into an episode: see docs/logs.md.
+"""Turn a recording from elsewhere into an episode: see tpcd/logs/README.md.
 
 python scripts/import_log.py run.csv --map time=t:ms x=X:mm z=Z:mm ... --stiffness 100 100 50 \
     --out runs/imported

@@ -1,4 +1,4 @@
-"""Explore an unknown object with a Universal Robots arm; docs/robot.md says what comes first.
+"""Explore an unknown object with a Universal Robots arm; see tpcd/robot/README.md first.
 
 python scripts/robot.py --robot 192.168.1.10 --x_axis -x --origin -0.7 0.1 0.05 --out runs/arm
 python scripts/robot.py --robot 127.0.0.2 --origin 0.4 0 0.1 --out runs/rehearsal

@@ -43,7 +43,7 @@ class ExploringOptions:
     workspace_high: tuple[float, float, float] = (1.0, 1.0, 0.15)
     """Upper corner of the workspace [m, m, rad]."""
     model: Path | None = None
-    """Model file with effects to estimate too, such as diagnose writes (docs/effects.md)."""
+    """Model file with effects to estimate too, such as diagnose writes (tpcd/effects/README.md)."""
     estimator: Literal["default", "paper"] = "default"
     """`paper` is the particle filter of arXiv 2409.17470 for comparison."""
     seed: int = 0

@@ -13,7 +13,8 @@ A YAML file:
     step:                                # optional: settings of the step
       substeps: 6
 
-Reading a file with `file:` runs the Python code in it; docs/effects.md says how to write one.
+Reading a file with `file:` runs the Python code in it; tpcd/effects/README.md says how to write
+one.
 """
 
 from __future__ import annotations
@@ -171,7 +172,9 @@ def load_effects(path: Path) -> tuple[Effect, ...]:
     for effect in effects:
         if not isinstance(effect, Effect):
             raise ModelError(
-                path, f"EFFECTS holds {effect!r}", "expected effects as docs/effects.md shows"
+                path,
+                f"EFFECTS holds {effect!r}",
+                "expected effects as tpcd/effects/README.md shows",
             )
         if effect.site not in SITES:
             raise ModelError(
@@ -182,7 +185,7 @@ def load_effects(path: Path) -> tuple[Effect, ...]:
         try:
             check_effect(effect)
         except EffectError as error:
-            raise ModelError(path, str(error), "see docs/effects.md") from error
+            raise ModelError(path, str(error), "see tpcd/effects/README.md") from error
         if not getattr(effect, "source", None):
             object.__setattr__(effect, "source", str(path))
     names = [effect.name for effect in effects]

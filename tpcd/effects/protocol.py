@@ -4,7 +4,7 @@ An effect says where it acts (its site), what its parameters are, which excitati
 be seen, and how it is reported. Its `apply` is pure and batched, and at the null values of the
 parameters returns conditions that hold the same bits as before.
 
-Write your own by giving an object these attributes; see docs/effects.md.
+Write your own by giving an object these attributes; see tpcd/effects/README.md.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ class MaskShape(PolygonShape):
     def latent_curvature(self, latent):
         return self.density.curvature(latent)
 
-    def sample_latent(self, count, generator):
+    def sample_latent(self, count, generator, checked=True):
         return self.density.sample(count, generator)
 
 

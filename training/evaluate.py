@@ -117,7 +117,7 @@ def level_set_errors(
 
 
 def plausible_share(shape: DeepSDFShape, latents: Float[Tensor, "count z"]) -> float:
-    """Share of latents that decode to exactly one closed outline of plausible size."""
+    """Share of latents whose level set is traced as exactly one closed curve of plausible size."""
     return float(decodes_plausibly(shape, latents, 0.003).mean())
 
 
@@ -139,6 +139,7 @@ def measure_prior(
         for key, value in errors.items():
             pooled.setdefault(key, []).append(value)
     latents = shape.sample_latent(draws, torch.Generator().manual_seed(seed))
+    unchecked = shape.sample_latent(draws, torch.Generator().manual_seed(seed), checked=False)
     away, felt = level_set_errors(shape, latents[: min(TRACED, draws // 4)])
     summary = {key: vars(Spread.of(np.concatenate(value))) for key, value in pooled.items()}
     return {
@@ -147,6 +148,7 @@ def measure_prior(
         "level_set_to_outline_mm": vars(Spread.of(away)),
         "level_set_support_mm": vars(Spread.of(felt[np.isfinite(felt)])),
         "level_set_is": f"traced on a grid of {MM * SPACING} mm at {len(felt)} draws",
+        "unchecked_valid_share": float(shape.valid(unchecked).double().mean()),
         "valid_share": plausible_share(shape, latents),
         "valid_draws": draws,
     }

@@ -1,7 +1,6 @@
 """Where a trained prior decodes to one plausible outline, and the density on that region.
 
-A decoded polygon is one closed outline by construction; what it may be is crossed, turned over, or
-of no plausible size. Two dimensions: a mask over the square, found by decoding the nodes of a grid
+Two dimensions: a mask over the square, found by decoding the nodes of a grid
 and what lies between them. More dimensions: the fitted mixture, cut off at the lowest density at
 which nearly all draws decode well. (A classifier of latents was tried instead of the floor: for
 the same purity it gave up half of the draws, the floor less than a tenth.)
@@ -10,7 +9,6 @@ the same purity it gave up half of the draws, the floor less than a tenth.)
 from __future__ import annotations
 
 import numpy as np
-import shapely
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,7 +16,7 @@ from torch import Tensor
 from tpcd.errors import TpcdError
 from tpcd.shape.deepsdf import UNIT, DeepSDFNetwork
 from tpcd.shape.density import MaskDensity, MixtureDensity
-from tpcd.shape.levelset import LARGEST_SIZE, SMALLEST_SIZE
+from tpcd.shape.simple import one_outline
 from training.mixture import Mixture
 
 
@@ -26,10 +24,6 @@ class TrainingError(TpcdError):
     """A training that led to no usable prior."""
 
 
-LARGEST_KNOT = 2e-3
-"""A latent is not valid where its polygon crosses itself and loses more than this share of its
-area. Smaller knots come with points that crowd at a concave corner and change nothing; to refuse
-them all would drop good outlines with thin parts."""
 LEFT_OUT = 0.02
 """Least share of the mixture's draws that lie below the density floor."""
 PRECISION = 0.998
@@ -49,28 +43,13 @@ LONELY_TRIALS = 12
 def decodes_well(
     network: DeepSDFNetwork, latents: Float[Tensor, "count z"]
 ) -> Bool[np.ndarray, " count"]:
-    """Whether each latent decodes to one closed outline of plausible size that runs
-    counter-clockwise and, but for small knots, does not cross itself."""
+    """Whether each latent decodes to one closed outline, see `one_outline`."""
     good = []
     for some in latents.split(1000):
         with torch.no_grad():
-            outlines = UNIT * network.outline(some.to(network.codes.dtype)).double().cpu().numpy()
-        after = np.roll(outlines, -1, axis=1)
-        area = (outlines[..., 0] * after[..., 1] - outlines[..., 1] * after[..., 0]).sum(1)
-        size = np.ptp(outlines, axis=1).max(-1)
-        fine = (area > 0) & (size >= SMALLEST_SIZE) & (size <= LARGEST_SIZE)
-        polygons = shapely.polygons(outlines)
-        crossed = fine & ~shapely.is_valid(polygons)
-        fine[crossed] = [_knot_share(polygon) < LARGEST_KNOT for polygon in polygons[crossed]]
-        good.append(fine)
+            outlines = network.outline(some.to(network.codes.dtype)).double().cpu().numpy()
+        good.append(one_outline(UNIT * outlines))
     return np.concatenate(good)
-
-
-def _knot_share(polygon: shapely.Polygon) -> float:
-    """Share of the area that does not belong to the largest loop of a crossing polygon."""
-    parts = shapely.get_parts(shapely.make_valid(polygon))
-    areas = [piece.area for part in parts for piece in shapely.get_parts(part)]
-    return 1.0 - max(areas) / sum(areas) if sum(areas) > 0 else 1.0
 
 
 def fit_mask(network: DeepSDFNetwork, cells: int) -> MaskDensity:

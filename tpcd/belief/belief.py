@@ -9,6 +9,7 @@ needs besides the shape model.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -161,7 +162,7 @@ def prior_belief(
     return Belief(
         prior=prior,
         vectors=vectors,
-        weights=weights / weights.sum(),
+        weights=of_valid_shapes(prior, vectors, weights / weights.sum()),
         misfit=misfit,
         misfit_sd=sd,
         misfit_mean=torch.zeros(len(sd), size, dtype=torch.float64),
@@ -190,14 +191,34 @@ def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
     )
 
 
+def of_valid_shapes(
+    prior: ParameterPrior, vectors: Float[Tensor, "m d"], weights: Float[Tensor, " m"]
+) -> Float[Tensor, " m"]:
+    """The weights, zero where the latent does not decode to one closed outline. Where no other is
+    left they stay as they are, and a warning says so."""
+    valid = prior.shape.valid(vectors[:, : prior.shape.latent_dim])
+    if bool(valid.all()):
+        return weights
+    kept = torch.where(valid, weights, torch.zeros_like(weights))
+    if not bool(kept.sum() > 0):
+        warnings.warn(
+            "none of the particles decodes to one closed outline: this prior does not know such an "
+            "object, and its outline is not to be trusted",
+            stacklevel=2,
+        )
+        return weights
+    return kept / kept.sum()
+
+
 def belief_of(cloud: Cloud, target: ContactTarget) -> Belief:
     """The belief that weighted particles stand for, given the history of the target."""
     assert target.history is not None
     found = target.evaluate(cloud.positions)
+    vectors = target.prior.to_vector(cloud.positions[:, :-1])
     return Belief(
         prior=target.prior,
-        vectors=target.prior.to_vector(cloud.positions[:, :-1]),
-        weights=cloud.weights,
+        vectors=vectors,
+        weights=of_valid_shapes(target.prior, vectors, cloud.weights),
         misfit=target.misfit,
         misfit_sd=target.misfit.sd_of(cloud.positions[:, -1]),
         misfit_mean=found.field_mean,

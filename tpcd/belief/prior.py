@@ -103,7 +103,7 @@ class ParameterPrior:
         return torch.special.ndtri(place)
 
     def log_density(self, score: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch"]:
-        """Log prior density in the unconstrained coordinates; -inf at an invalid shape."""
+        """Log prior density in the unconstrained coordinates; -inf far from valid shapes."""
         normal = -0.5 * (score**2).sum(-1) - 0.5 * self.dimension * math.log(2 * math.pi)
         z = self.shape.latent_dim
         if z == 0:
@@ -129,13 +129,16 @@ class ParameterPrior:
             precision[..., :z, :z] += slope[..., :, None] * own * slope[..., None, :]
         return gradient, precision
 
-    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "count d"]:
-        """Draw unconstrained coordinates from the prior."""
+    def sample(
+        self, count: int, generator: torch.Generator, checked: bool = True
+    ) -> Float[Tensor, "count d"]:
+        """Draw unconstrained coordinates from the prior, with valid shapes only unless not
+        `checked`."""
         score = torch.randn(count, self.dimension, generator=generator, dtype=torch.float64)
         z = self.shape.latent_dim
         if z == 0:
             return score
-        latent = self.shape.sample_latent(count, generator).double()
+        latent = self.shape.sample_latent(count, generator, checked).double()
         place = ((latent + 1) / 2).clamp(_EDGE, 1 - _EDGE)
         return torch.cat((torch.special.ndtri(place), score[:, z:]), dim=-1)
 

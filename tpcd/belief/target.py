@@ -45,8 +45,8 @@ class ContactTarget:
         return replace(self, history=history)
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "m s"]:
-        """Draws from the prior."""
-        score = self.prior.sample(count, generator)
+        """Draws from the prior, whose shapes are not checked: what a belief holds in the end is."""
+        score = self.prior.sample(count, generator, checked=False)
         misfit = torch.randn(count, 1, generator=generator, dtype=torch.float64)
         return torch.cat((score, misfit), dim=-1)
 

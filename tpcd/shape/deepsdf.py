@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from tpcd.shape.density import LatentDensity
 from tpcd.shape.distance import polygon_distance
 from tpcd.shape.protocol import Misfit
+from tpcd.shape.simple import one_outline
 
 UNIT = 0.1
 """Length that the networks see as 1 [m]."""
@@ -141,11 +142,17 @@ class DeepSDFShape:
         return (network.outline(latent.to(network.codes.dtype)) * UNIT).to(latent.dtype)
 
     def valid(self, latent: Float[Tensor, "*batch z"]) -> Bool[Tensor, "*batch"]:
-        """Whether the latent decodes to exactly one closed outline of plausible size."""
-        return self.density.valid(latent)
+        """Whether the latent decodes to exactly one closed outline of plausible size, and lies
+        where the density is positive."""
+        valid = self.density.valid(latent)
+        with torch.no_grad():
+            outlines = self.boundary_points(latent[valid]).double().cpu().numpy()
+        valid[valid.clone()] = torch.from_numpy(one_outline(outlines)).to(valid.device)
+        return valid
 
     def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
-        """Log of the normalised prior density of the latent; -inf where not valid."""
+        """Log of the prior density of the latent; -inf outside of the region that it is cut off at,
+        in which a few latents of a thousand are not valid."""
         return self.density.log_density(latent)
 
     def latent_curvature(
@@ -155,9 +162,16 @@ class DeepSDFShape:
         semi-definite, that bounds its curvature."""
         return self.density.curvature(latent)
 
-    def sample_latent(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
-        """Draw valid latents from the prior, float64 on the CPU."""
-        return self.density.sample(count, generator)
+    def sample_latent(
+        self, count: int, generator: torch.Generator, checked: bool = True
+    ) -> Float[Tensor, "count z"]:
+        """Draw valid latents from the prior, float64 on the CPU; without the check a few of a
+        thousand are not valid."""
+        draws = self.density.sample(count, generator)
+        while checked and not bool((valid := self.valid(draws)).all()):
+            again = self.density.sample(count - int(valid.sum()), generator)
+            draws = torch.cat((draws[valid], again))
+        return draws
 
     def _on(self, device: torch.device) -> DeepSDFNetwork:
         """The network on the latent's device, copied there once."""

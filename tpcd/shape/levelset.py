@@ -19,8 +19,8 @@ from tpcd.shape.protocol import Shape
 
 HALF_WIDTH = 0.2
 """Half the side of the square that is searched for level sets [m]."""
-FINE = 0.0005
-"""Grid step at which a latent is finally judged [m]."""
+FINE = (0.0005, 0.0001)
+"""Grid steps at which a latent that fails on a coarser grid is looked at again [m]."""
 COARSENING = 4
 """Fine grid steps in one coarse step; the fine grid is evaluated only near the outline."""
 SMALLEST_SIZE, LARGEST_SIZE = 0.015, 0.36
@@ -77,11 +77,13 @@ def decodes_plausibly(
 ) -> Bool[np.ndarray, " count"]:
     """Whether each latent decodes to exactly one closed outline of plausible size.
 
-    What fails at `spacing` [m] is looked at again at `FINE`: a coarse grid cuts thin tips off.
+    What fails at `spacing` [m] is looked at again at each of `FINE`: a coarse grid cuts necks and
+    tips that are thinner than it.
     """
-    good = np.array([found.plausible for found in decode_many(shape, latents, spacing)], dtype=bool)
-    again = latents[torch.from_numpy(~good).to(latents.device)]
-    good[~good] = [found.plausible for found in decode_many(shape, again, FINE)]
+    good = np.zeros(len(latents), dtype=bool)
+    for step in (spacing, *FINE):
+        again = latents[torch.from_numpy(~good).to(latents.device)]
+        good[~good] = [found.plausible for found in decode_many(shape, again, step)]
     return good
 
 

@@ -66,7 +66,9 @@ class PolygonShape:
         """Of a latent of size zero."""
         return torch.zeros_like(latent), latent.new_zeros(*latent.shape, latent.shape[-1])
 
-    def sample_latent(self, count: int, generator: torch.Generator) -> Float64[Tensor, "count z"]:
+    def sample_latent(
+        self, count: int, generator: torch.Generator, checked: bool = True
+    ) -> Float64[Tensor, "count z"]:
         """Latents of size zero (count, 0), float64 on the CPU."""
         return torch.zeros((count, 0), dtype=torch.float64)
 

@@ -82,7 +82,7 @@ class Shape(Protocol):
         ...
 
     def log_density(self, latent: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch"]:
-        """Log of the normalised prior density of the latent; -inf where not valid."""
+        """Log of the prior density of the latent; -inf far from what is valid."""
         ...
 
     def latent_curvature(
@@ -92,6 +92,9 @@ class Shape(Protocol):
         semi-definite, that bounds its curvature."""
         ...
 
-    def sample_latent(self, count: int, generator: torch.Generator) -> Float[Tensor, "count z"]:
-        """Draw valid latents from the prior, float64 on the CPU."""
+    def sample_latent(
+        self, count: int, generator: torch.Generator, checked: bool = True
+    ) -> Float[Tensor, "count z"]:
+        """Draw valid latents from the prior, float64 on the CPU; without the check, which takes
+        time, a few of them may not be valid."""
         ...

@@ -1,7 +1,8 @@
 """Simulation-based calibration of an estimator on the contact model (Talts et al. 2018).
 
 Each run draws theta from the prior, an episode given theta, and asks where theta lies in the
-posterior: its place u = P(entry < true entry | data) is uniform when the posterior is right.
+posterior: its place u = P(entry < true entry | data), by as many draws as the belief is worth, is
+uniform when the posterior is right.
 `eval/drawn.py` says how exactly the episodes come from the likelihood's own model. So what is
 asked is whether likelihood and sampler are right.
 With `--estimator paper` the data are the same, while that filter assumes another noise: its
@@ -198,6 +199,7 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     from tpcd.belief.history import history_of
     from tpcd.belief.paper import PaperSettings
     from tpcd.belief.prior import make_prior
+    from tpcd.belief.resampling import weighted_place
     from tpcd.belief.settings import EstimatorSettings, SamplerSettings
     from tpcd.exploration import Estimator
 
@@ -227,8 +229,8 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     found = torch.cat((belief.vectors, belief.misfit_sd[:, None]), dim=-1)
     if config.estimator == "paper":
         found, truth = belief.vectors, truth[:-1]
-    below = (found < truth).double() + 0.5 * (found == truth).double()
-    return {"place": (belief.weights @ below).tolist()}
+    place = weighted_place(found, belief.weights, truth, belief.effective)
+    return {"place": place.tolist(), "effective": belief.effective}
 
 
 def _shape(config: Calibration) -> Shape:

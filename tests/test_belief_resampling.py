@@ -15,6 +15,8 @@ from tpcd.belief.resampling import (
     multinomial_resample,
     normalise_log_weights,
     systematic_resample,
+    weighted_place,
+    weighted_quantile,
 )
 
 
@@ -99,3 +101,40 @@ def test_multinomial_draws_have_the_right_mean() -> None:
     found = torch.bincount(index, minlength=4) / 20_000
     assert (found - weights).abs().max() < 0.015
     assert found[1] == 0
+
+
+@pytest.mark.parametrize("count", [20, 37, 150])
+def test_intervals_of_few_draws_hold_a_further_draw_as_often_as_they_say(count: int) -> None:
+    runs = 20_000
+    draws = torch.randn(count, runs, generator=generator(1), dtype=torch.float64)
+    truth = torch.randn(runs, generator=generator(2), dtype=torch.float64)
+    weights = torch.full((count,), 1.0 / count, dtype=torch.float64)
+    for level in (0.5, 0.9):
+        ends = [0.5 - level / 2, 0.5 + level / 2]
+        low, high = (weighted_quantile(draws, weights, end, float(count)) for end in ends)
+        inside = float(((low <= truth) & (truth <= high)).double().mean())
+        # An interval ends at a draw: up to half a rank of what is asked for at each end.
+        rounding = 1.0 / (count + 1)
+        assert abs(inside - level) < rounding + 4 * math.sqrt(0.25 / runs)
+    place = weighted_place(draws, weights, truth, float(count))
+    held = ((place >= 0.05) & (place <= 0.95)).double().mean()
+    plain = weighted_place(draws, weights, truth)
+    without = ((plain >= 0.05) & (plain <= 0.95)).double().mean()
+    assert abs(float(held) - 0.9) < 2.0 / (count + 1)
+    assert float(without) <= float(held)
+    quantile = weighted_quantile(draws, weights, 0.3, float(count))
+    at_quantile = weighted_place(draws, weights, quantile, float(count))
+    assert ((at_quantile - 0.3).abs() <= 1.0 / (count + 1)).all()
+
+
+def test_quantiles_and_places_stay_within_values_that_have_a_weight() -> None:
+    values = torch.tensor([[5.0], [1.0], [2.0], [9.0]], dtype=torch.float64)
+    weights = torch.tensor([0.5, 0.0, 0.5, 0.0], dtype=torch.float64)
+    for level in (0.001, 0.05, 0.95, 0.999):
+        for effective in (1.0, 2.0, math.inf):
+            found = float(weighted_quantile(values, weights, level, effective))
+            assert found == (2.0 if level < 0.5 else 5.0)
+    at = torch.tensor([1.5], dtype=torch.float64)
+    assert weighted_place(values, weights, at, 2.0).tolist() == [0.0]
+    assert weighted_place(values, weights, at + 7, 2.0).tolist() == [1.0]
+    assert weighted_place(values, weights, at + 2, 2.0).tolist() == [0.5]

@@ -30,7 +30,7 @@ from tpcd.belief.importance import assimilate
 from tpcd.belief.likelihood import effective_setting
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
-from tpcd.belief.resampling import weighted_quantile
+from tpcd.belief.resampling import effective_sample_size, weighted_quantile
 from tpcd.belief.settings import EstimatorSettings
 from tpcd.belief.state import EstimatorState
 from tpcd.belief.target import ContactTarget
@@ -75,9 +75,24 @@ class Belief:
         """Posterior mean of theta."""
         return self.weights @ self.vectors
 
+    @property
+    def effective(self) -> float:
+        """How many independent draws from the posterior the particles are worth: Kish's number of
+        their weights, or of the draws that they were chosen from, by the error of the evidence."""
+        own = effective_sample_size(self.weights)
+        if not self.log_evidence_std > 0:
+            return own
+        return min(own, self.log_evidence_std**-2)
+
     def quantile(self, level: float) -> Float[Tensor, " d"]:
-        """Weighted quantile of every entry of theta."""
-        return weighted_quantile(self.vectors, self.weights, level)
+        """Quantile of every entry of theta, further out where the particles are worth few draws."""
+        return self.quantile_of(self.vectors, level)
+
+    def quantile_of(
+        self, values: Float[Tensor, " m *columns"], level: float
+    ) -> Float[Tensor, "*columns"]:
+        """The same of anything that the particles have a value of."""
+        return weighted_quantile(values, self.weights, level, self.effective)
 
     def std(self) -> Float[Tensor, " d"]:
         """Posterior standard deviation of every entry of theta."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -53,10 +55,43 @@ def multinomial_resample(
 
 
 def weighted_quantile(
-    values: Float[Tensor, " m *columns"], weights: Float[Tensor, " m"], level: float
+    values: Float[Tensor, " m *columns"],
+    weights: Float[Tensor, " m"],
+    level: float,
+    effective: float = math.inf,
 ) -> Float[Tensor, "*columns"]:
-    """Smallest value of each column at which the weights sum up to the level."""
+    """Smallest value of each column at which the weights sum up to the level.
+
+    Where the values are worth so many independent draws, n of a distribution, a further draw lies
+    below the k-th smallest of them with probability k / (n + 1) (Hyndman and Fan 1996, type 6). So
+    levels move outwards the fewer they are, and at most to the ends of the values.
+    """
+    if math.isfinite(effective):
+        level = (level * (effective + 1) - 0.5) / effective
     ordered, order = values.sort(dim=0)
     cumulative = weights[order].cumsum(0)
-    first = (cumulative >= level * cumulative[-1]).double().argmax(0)
+    # Above zero: values without weight are none.
+    share = min(max(level, 1e-12), 1.0)
+    first = (cumulative >= share * cumulative[-1]).double().argmax(0)
     return ordered.gather(0, first[None])[0]
+
+
+def weighted_place(
+    values: Float[Tensor, " m *columns"],
+    weights: Float[Tensor, " m"],
+    at: Float[Tensor, "*columns"],
+    effective: float = math.inf,
+) -> Float[Tensor, "*columns"]:
+    """Probability that a further draw lies below `at`: the level whose `weighted_quantile` that is.
+
+    0 below all values and 1 above.
+    """
+    column = weights.reshape(-1, *(1,) * (values.ndim - 1))
+    below = (column * ((values < at).double() + 0.5 * (values == at).double())).sum(0)
+    below = below / weights.sum()
+    if not math.isfinite(effective):
+        return below
+    place = (effective * below + 0.5) / (effective + 1)
+    # Rounded sums of weights are not exactly 0 and 1.
+    outside = torch.where(below < 0.5, 0.0, 1.0).to(below.dtype)
+    return torch.where((below < 1e-9) | (below > 1 - 1e-9), outside, place)

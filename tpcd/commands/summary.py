@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.belief import Belief
-from tpcd.belief.resampling import weighted_quantile
 
 STILL_PRIOR = 0.85
 """A 90 % interval that covers more than this share of the prior's counts as nothing learnt."""
@@ -37,8 +36,7 @@ def summarise(belief: Belief) -> dict[str, Any]:
         "outline_misfit_sd": {
             "mean": float(belief.weights @ belief.misfit_sd),
             "interval_90": [
-                float(weighted_quantile(belief.misfit_sd, belief.weights, level))
-                for level in (0.05, 0.95)
+                float(belief.quantile_of(belief.misfit_sd, level)) for level in (0.05, 0.95)
             ],
             "unit": "m",
         },

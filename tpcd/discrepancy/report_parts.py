@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import torch
 
 from tpcd.belief.belief import Belief
-from tpcd.belief.resampling import weighted_quantile
 from tpcd.contact import place_points
 from tpcd.discrepancy.coverage import Coverage
 from tpcd.discrepancy.diagnosis import Estimate, Limit, NamedEffect
@@ -55,7 +54,7 @@ def size_estimates(belief: Belief) -> tuple[Estimate, ...]:
     sizes = sizes + belief.misfit_sd[:, None] * off
     mean = weights @ sizes
     std = (weights @ (sizes - mean) ** 2).sqrt()
-    low, high = (weighted_quantile(sizes, weights, level) for level in (0.05, 0.95))
+    low, high = (belief.quantile_of(sizes, level) for level in (0.05, 0.95))
     columns = zip(SIZES, *(c.tolist() for c in (mean, std, low, high)), strict=True)
     return tuple(Estimate(*column, "m") for column in columns)
 

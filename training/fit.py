@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tpcd.planar import transform_points
 from tpcd.shape.deepsdf import DeepSDFShape
+from tpcd.shape.distance import polygon_distance
 from training.evaluate import MM, support_of, uniform_points
 
 STARTS, FIRST_STEPS = 32, 40
@@ -72,7 +73,7 @@ def best_fit(
     def loss_of(latent: Tensor, free: Tensor) -> Tensor:
         placed = _placed(shape, latent, free if scene else 0 * free)
         support = ((placed @ around).amax(-2) - true_support).abs().mean(-1)
-        return _distance(true, placed).mean(-1) + support
+        return polygon_distance(true.expand(len(placed), -1, -1), placed).abs().mean(-1) + support
 
     for count, steps in ((STARTS, FIRST_STEPS), (KEPT, LAST_STEPS)):
         latent, free, loss = _descend(shape, loss_of, latent[:count], free[:count], steps)
@@ -120,13 +121,3 @@ def _placed(shape: DeepSDFShape, latent: Tensor, free: Tensor) -> Tensor:
     scale, x, z, angle = (torch.tanh(free) * torch.tensor(REACH)).unbind(-1)
     points = (1 + scale)[:, None, None] * shape.boundary_points(latent)
     return transform_points(torch.stack((x, z, angle), dim=-1), points)
-
-
-def _distance(points: Tensor, polygons: Tensor) -> Tensor:
-    """Distance of points (p, 2) to each closed polygon (k, v, 2): (k, p)."""
-    edges = torch.roll(polygons, -1, 1) - polygons
-    offsets = points[None, :, None] - polygons[:, None]
-    squares = edges.square().sum(-1).clamp_min(1e-12)
-    along = ((offsets * edges[:, None]).sum(-1) / squares[:, None]).clamp(0, 1)
-    apart = offsets - along[..., None] * edges[:, None]
-    return (apart.square().sum(-1).amin(-1) + 1e-10).sqrt()

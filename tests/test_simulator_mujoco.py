@@ -1,7 +1,7 @@
 """The quasi-static step against MuJoCo, which shares no code with it.
 
 Episodes of exploration and of test trajectories are simulated by MuJoCo; every transition is
-then predicted from where MuJoCo really was. Force is judged by its x and z, pose by x and z.
+then predicted from where MuJoCo really was. Force and position are judged by x and z together.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import pytest
 import torch
 from contact_scenes import OUTLINES, make_scene
 
+from tpcd.planar import wrap_angle
 from tpcd.shape.builtin import make_entry
 from tpcd.shape.household import ENTRIES
 from tpcd.simulator import StepSettings, simulate_step
@@ -23,16 +24,22 @@ MEAN_FORCE = 0.02
 """Largest mean error of a force [N]."""
 MEAN_POSE = 2e-4
 """Largest mean error of a position [m]."""
+MEAN_TORQUE = 0.01
+"""Largest mean error of the torque [N·m]: half of the usual sensor noise."""
+MEAN_ANGLE = 2e-4
+"""Largest mean error of the angle [rad], which has that torque at 50 N·m/rad."""
 SETTINGS = StepSettings(friction="coulomb", substeps=10, follow_path=True)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of n transitions: force (n, 2) [N], position (n, 2) [m], torque (n) [N·m]."""
+    """Errors of n transitions: force (n, 2) [N], position (n, 2) [m], torque (n) [N·m], angle (n)
+    [rad]."""
 
     force: torch.Tensor
     position: torch.Tensor
     torque: torch.Tensor
+    angle: torch.Tensor
     names: tuple[str, ...]
 
     @property
@@ -44,7 +51,8 @@ class Comparison:
             f"{len(force)} transitions: force {force.mean():.4f} N (99 %: "
             f"{force.flatten().quantile(0.99):.3f}, worst {force.max():.3f} on "
             f"{self.names[worst]}), position {position.mean() * 1e3:.4f} mm, "
-            f"torque {self.torque.abs().mean():.5f} N·m"
+            f"torque {self.torque.abs().mean():.5f} N·m, "
+            f"angle {self.angle.abs().mean() * 1e3:.4f} mrad"
         )
 
 
@@ -77,10 +85,11 @@ def compare(
             )
             wrench = transition.wrench - episode.wrenches[1:]
             pose = transition.pose - episode.poses[1:]
-            parts.append(torch.cat((wrench[:, :2], pose[:, :2], wrench[:, 2:]), dim=-1))
+            angle = wrap_angle(pose[:, 2:])
+            parts.append(torch.cat((wrench[:, :2], pose[:, :2], wrench[:, 2:], angle), dim=-1))
             names += [f"{name} ({policy} {row})" for row in range(1, steps + 1)]
     errors = torch.cat(parts)
-    return Comparison(errors[:, :2], errors[:, 2:4], errors[:, 4], tuple(names))
+    return Comparison(errors[:, :2], errors[:, 2:4], errors[:, 4], errors[:, 5], tuple(names))
 
 
 def builtin(count: int) -> dict[str, np.ndarray]:
@@ -91,6 +100,8 @@ def check(comparison: Comparison) -> None:
     print(comparison.report)
     assert float(comparison.force.abs().mean()) <= MEAN_FORCE, comparison.report
     assert float(comparison.position.abs().mean()) <= MEAN_POSE, comparison.report
+    assert float(comparison.torque.abs().mean()) <= MEAN_TORQUE, comparison.report
+    assert float(comparison.angle.abs().mean()) <= MEAN_ANGLE, comparison.report
 
 
 def test_transitions_of_test_trajectories_end_where_mujoco_ends():

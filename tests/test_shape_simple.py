@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ import torch
 from tpcd.belief.belief import of_valid_shapes
 from tpcd.belief.prior import make_prior
 from tpcd.shape.checkpoint import load_prior
+from tpcd.shape.deepsdf import DeepSDFNetwork
 from tpcd.shape.simple import one_outline
 
 SQUARE = 0.03 * np.array([[-1.0, -1], [0, -1], [1, -1], [1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0]])
@@ -66,3 +69,14 @@ def test_a_belief_gives_no_weight_to_such_an_outline() -> None:
     vectors[:, : shape.latent_dim] = bad
     with pytest.warns(UserWarning, match="none of the particles decodes"):
         assert of_valid_shapes(prior, vectors, weights).equal(weights)
+
+
+def test_a_prior_of_which_nothing_is_valid_says_so() -> None:
+    shape = load_prior("ycb21-z2")
+    inside_out = DeepSDFNetwork(shape.network.architecture, len(shape.names))
+    with torch.no_grad():
+        for parameter in inside_out.parameters():
+            parameter.zero_()
+    empty = replace(shape, network=inside_out, _copies={})
+    with pytest.raises(ValueError, match="5 of 5 latents still decode to no closed outline"):
+        empty.sample_latent(5, torch.Generator().manual_seed(0))

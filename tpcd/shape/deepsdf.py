@@ -27,6 +27,8 @@ from tpcd.shape.simple import one_outline
 
 UNIT = 0.1
 """Length that the networks see as 1 [m]."""
+_ROUNDS = 100
+"""Rounds at most in which latents that are not valid are drawn anew."""
 
 
 class Sine(nn.Module):
@@ -166,12 +168,20 @@ class DeepSDFShape:
         self, count: int, generator: torch.Generator, checked: bool = True
     ) -> Float[Tensor, "count z"]:
         """Draw valid latents from the prior, float64 on the CPU; without the check a few of a
-        thousand are not valid."""
+        thousand are not valid. Raises ValueError where hardly any is."""
         draws = self.density.sample(count, generator)
-        while checked and not bool((valid := self.valid(draws)).all()):
-            again = self.density.sample(count - int(valid.sum()), generator)
-            draws = torch.cat((draws[valid], again))
-        return draws
+        for _ in range(_ROUNDS if checked else 0):
+            kept = draws[self.valid(draws)]
+            missing = count - len(kept)
+            if missing == 0:
+                return kept
+            draws = torch.cat((kept, self.density.sample(missing, generator)))
+        if not checked:
+            return draws
+        raise ValueError(
+            f"after {_ROUNDS} rounds of drawing anew, {missing} of {count} latents still decode to "
+            "no closed outline; train this prior for more steps"
+        )
 
     def _on(self, device: torch.device) -> DeepSDFNetwork:
         """The network on the latent's device, copied there once."""

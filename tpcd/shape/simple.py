@@ -27,8 +27,8 @@ def one_outline(polygons: Float64[np.ndarray, "m p 2"]) -> Bool[np.ndarray, " m"
     fine = (area > 0) & (size >= SMALLEST_SIZE) & (size <= LARGEST_SIZE)
     found = np.flatnonzero(fine)
     rings = shapely.polygons(polygons[found])
-    crossed = ~shapely.is_valid(rings)
-    fine[found[crossed]] = [_knot_share(ring) < LARGEST_KNOT for ring in rings[crossed]]
+    for index in np.flatnonzero(~shapely.is_valid(rings)):
+        fine[found[index]] = _knot_share(rings[index]) < LARGEST_KNOT
     return fine
 
 

@@ -39,6 +39,7 @@ from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
+from tpcd.simulator.native import torch_in_one_thread
 
 _SOME_FREE = 1e-3
 """Where no draw is free at the start with this probability, they are not weighted by it."""
@@ -225,6 +226,7 @@ def of_valid_shapes(
     return kept / kept.sum()
 
 
+@torch_in_one_thread
 def belief_of(cloud: Cloud, target: ContactTarget) -> Belief:
     """The belief that weighted particles stand for, given the history of the target."""
     assert target.history is not None

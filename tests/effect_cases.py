@@ -21,7 +21,7 @@ from tpcd.simulator import StepSettings
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
-DOCS = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+DOCS = (ROOT / "tpcd" / "effects" / "README.md").read_text(encoding="utf-8")
 SHAPE = PolygonShape(builtin_outlines()["mug"])
 
 

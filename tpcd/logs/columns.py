@@ -114,7 +114,7 @@ def log_from_columns(
     for name, (column, factor) in mapped.items():
         if columns[column].dtype.kind != "f":
             example = next(iter(columns[column]))
-            raise LogError(path, f"column {column!r} holds {example!r}", "expected numbers")
+            raise LogError(path, f"column {column!r} holds {str(example)!r}", "expected numbers")
         values[name] = factor * columns[column]
     for column in keep:
         _find(column, columns, path)

@@ -229,8 +229,9 @@ def _one_run(config: Calibration, shape: Shape, seed: int) -> dict[str, Any]:
     found = torch.cat((belief.vectors, belief.misfit_sd[:, None]), dim=-1)
     if config.estimator == "paper":
         found, truth = belief.vectors, truth[:-1]
-    place = weighted_place(found, belief.weights, truth, belief.effective)
-    return {"place": place.tolist(), "effective": belief.effective}
+    worth = belief.effective_sample_size
+    place = weighted_place(found, belief.weights, truth, worth)
+    return {"place": place.tolist(), "effective_sample_size": worth}
 
 
 def _shape(config: Calibration) -> Shape:

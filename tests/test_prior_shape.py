@@ -64,17 +64,18 @@ def test_draws_are_valid_and_decode_to_one_closed_outline(name: str) -> None:
     # 99.5 % of draws must decode: more than 6 failures in 200 has a chance below 1e-4.
     assert bad <= 6
     assert shape.card["valid_share"] >= 0.995
+    assert shape.card["unchecked_valid_share"] >= 0.995
     assert shape.card["valid_draws"] >= 1000
 
 
 @pytest.mark.parametrize("name", PRIORS)
-def test_outlines_run_counter_clockwise_and_hardly_ever_cross_themselves(name: str) -> None:
+def test_outlines_run_counter_clockwise_and_do_not_cross_themselves(name: str) -> None:
     shape, latents = prior(name), draws(name, 300, seed=1)
     points = shape.boundary_points(latents)
     after = points.roll(-1, -2)
     areas = points[..., 0] * after[..., 1] - points[..., 1] * after[..., 0]
     assert (areas.sum(-1) > 0).all()
-    assert decodes_well(shape.network, latents).mean() >= 0.98
+    assert decodes_well(shape.network, latents).all()
 
 
 @pytest.mark.parametrize("name", PRIORS)

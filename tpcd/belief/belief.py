@@ -77,7 +77,7 @@ class Belief:
         return self.weights @ self.vectors
 
     @property
-    def effective(self) -> float:
+    def effective_sample_size(self) -> float:
         """How many independent draws from the posterior the particles are worth: Kish's number of
         their weights, or of the draws that they were chosen from, by the error of the evidence."""
         own = effective_sample_size(self.weights)
@@ -93,7 +93,7 @@ class Belief:
         self, values: Float[Tensor, " m *columns"], level: float
     ) -> Float[Tensor, "*columns"]:
         """The same of anything that the particles have a value of."""
-        return weighted_quantile(values, self.weights, level, self.effective)
+        return weighted_quantile(values, self.weights, level, self.effective_sample_size)
 
     def std(self) -> Float[Tensor, " d"]:
         """Posterior standard deviation of every entry of theta."""

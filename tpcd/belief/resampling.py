@@ -58,7 +58,7 @@ def weighted_quantile(
     values: Float[Tensor, " m *columns"],
     weights: Float[Tensor, " m"],
     level: float,
-    effective: float = math.inf,
+    sample_size: float = math.inf,
 ) -> Float[Tensor, "*columns"]:
     """Smallest value of each column at which the weights sum up to the level.
 
@@ -66,8 +66,8 @@ def weighted_quantile(
     below the k-th smallest of them with probability k / (n + 1) (Hyndman and Fan 1996, type 6). So
     levels move outwards the fewer they are, and at most to the ends of the values.
     """
-    if math.isfinite(effective):
-        level = (level * (effective + 1) - 0.5) / effective
+    if math.isfinite(sample_size):
+        level = (level * (sample_size + 1) - 0.5) / sample_size
     ordered, order = values.sort(dim=0)
     cumulative = weights[order].cumsum(0)
     # Above zero: values without weight are none.
@@ -80,7 +80,7 @@ def weighted_place(
     values: Float[Tensor, " m *columns"],
     weights: Float[Tensor, " m"],
     at: Float[Tensor, "*columns"],
-    effective: float = math.inf,
+    sample_size: float = math.inf,
 ) -> Float[Tensor, "*columns"]:
     """Probability that a further draw lies below `at`: the level whose `weighted_quantile` that is.
 
@@ -89,9 +89,9 @@ def weighted_place(
     column = weights.reshape(-1, *(1,) * (values.ndim - 1))
     below = (column * ((values < at).double() + 0.5 * (values == at).double())).sum(0)
     below = below / weights.sum()
-    if not math.isfinite(effective):
+    if not math.isfinite(sample_size):
         return below
-    place = (effective * below + 0.5) / (effective + 1)
+    place = (sample_size * below + 0.5) / (sample_size + 1)
     # Rounded sums of weights are not exactly 0 and 1.
     outside = torch.where(below < 0.5, 0.0, 1.0).to(below.dtype)
     return torch.where((below < 1e-9) | (below > 1 - 1e-9), outside, place)

@@ -19,7 +19,9 @@ Departures from the text, and what it leaves open:
   the default here.
 - Normalisation in the log domain; resampling is systematic (the text does not say).
 - Noise that carries an entry out of its box is reflected at the wall. A latent whose
-  roughened place the shape model does not call valid stays at its place before.
+  roughened place has no prior density stays at its place before. After the last datum, latents
+  that do not decode to one closed outline get weight zero; to ask that of all particles at each
+  datum would double the time of a step.
 - A particle whose step fails, or is not finite, gets weight zero.
 - The weights of the filter do not estimate the evidence; that of its beliefs is NaN.
 """
@@ -35,7 +37,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.belief import Belief, EstimationStep
+from tpcd.belief.belief import Belief, EstimationStep, of_valid_shapes
 from tpcd.belief.cloud import CloudInfo
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior, make_prior
@@ -97,7 +99,7 @@ def estimate_paper(
     """Run the filter over an episode, yielding the belief after each transition.
 
     The episode's own priors replace the defaults; the latent is uniform where the shape
-    model calls it valid. Beliefs carry no misfit field and no evidence (NaN). In `info`,
+    model's density is positive. Beliefs carry no misfit field and no evidence (NaN). In `info`,
     `rounds` counts resamplings (0 or 1), and `distinct` the particles of the step before that
     have descendants. With the `state` of an earlier step it goes on after
     that step. Raises ValueError where no particle explains the data.
@@ -131,7 +133,9 @@ def estimate_paper(
             distinct=int(ancestors.unique().numel()),
             evaluations=count,
         )
-        belief = _belief(prior, vectors, weights, episode, settings)
+        last = k + 1 == len(episode)
+        shown = of_valid_shapes(prior, vectors, weights) if last else weights
+        belief = _belief(prior, vectors, shown, episode, settings)
         seconds = time.perf_counter() - started
         kept = {"vectors": vectors, "log_weights": log_weights}
         after = EstimatorState(k, kept, generator.get_state())
@@ -204,8 +208,8 @@ def _roughen(
     noise = torch.randn(vectors.shape, generator=generator, dtype=torch.float64)
     moved = reflect(vectors + roughening_std(vectors, roughness) * noise, prior.low, prior.high)
     z = prior.shape.latent_dim
-    valid = prior.shape.valid(moved[:, :z])
-    latent = torch.where(valid[:, None], moved[:, :z], vectors[:, :z])
+    dense = prior.shape.log_density(moved[:, :z]) > -torch.inf
+    latent = torch.where(dense[:, None], moved[:, :z], vectors[:, :z])
     return torch.cat((latent, moved[:, z:]), dim=-1)
 
 
@@ -216,7 +220,7 @@ def _draw_prior(prior: ParameterPrior, count: int, generator: torch.Generator) -
     for _ in range(1000):
         uniform = torch.rand(count, d, generator=generator, dtype=torch.float64)
         draws = prior.low + (prior.high - prior.low) * uniform
-        kept = torch.cat((kept, draws[prior.shape.valid(draws[:, :z])]))
+        kept = torch.cat((kept, draws[prior.shape.log_density(draws[:, :z]) > -torch.inf]))
         if len(kept) >= count:
             return kept[:count]
     raise ValueError(

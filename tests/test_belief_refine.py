@@ -84,6 +84,8 @@ def test_the_closing_budget_has_the_particles_of_the_other_and_more_draws_for_ef
     [
         ("closing_passes", 0, "at least 1"),
         ("closing_worth", math.nan, "at least 0"),
+        ("likelihood_power", 0.0, "above 0 and at most 1"),
+        ("likelihood_power", 1.1, "above 0 and at most 1"),
     ],
 )
 def test_settings_without_meaning_are_refused(name: str, value: float, expected: str) -> None:

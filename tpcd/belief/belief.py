@@ -146,7 +146,8 @@ def estimate(
 def target_of(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
     """The posterior to sample from, still without data."""
     prior = make_prior(shape, episode.priors, settings.effects)
-    return ContactTarget(prior, misfit_field(shape, settings), settings.step)
+    field, power = misfit_field(shape, settings), settings.likelihood_power
+    return ContactTarget(prior, field, settings.step, power=power)
 
 
 def prior_belief(

@@ -102,6 +102,10 @@ class EstimatorSettings:
     """Effective number of closing draws with which they need not be adapted again."""
     step: StepSettings = field(default_factory=StepSettings)
     """The quasi-static model."""
+    likelihood_power: float = 0.92
+    """Power to which the likelihood is raised, for what it linearises: measured (eval/README.md),
+    the power at which 90 % of the intervals of theta hold the truth given all else. An evidence is
+    of the likelihood to this power too; 1 is that of Bayes."""
     misfit_sd: float | None = None
     """Median of the standard deviation of the outline misfit [m] before any datum; None takes
     the shape model's own figures, of the median and of the spread."""
@@ -122,6 +126,10 @@ class EstimatorSettings:
         """Refuse choices without meaning."""
         if not self.closing_passes >= 1:
             raise ValueError(f"closing_passes is {self.closing_passes}, expected at least 1")
+        if not 0 < self.likelihood_power <= 1:
+            raise ValueError(
+                f"likelihood_power is {self.likelihood_power}, expected above 0 and at most 1"
+            )
         if not self.closing_worth >= 0:
             raise ValueError(f"closing_worth is {self.closing_worth}, expected at least 0")
 

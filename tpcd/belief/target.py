@@ -38,7 +38,8 @@ class ContactTarget:
     history: History | None = None
     power: float = 1.0
     """Power to which the likelihood is raised: below 1 the posterior is wider than Bayes' own, for
-    data that are known to be unlike the model (coarsened posteriors: Miller and Dunson 2019)."""
+    a likelihood that is not quite that of the data (coarsened posteriors: Miller and Dunson 2019).
+    """
 
     def given(self, history: History) -> ContactTarget:
         """The same with a history."""

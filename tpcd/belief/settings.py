@@ -23,11 +23,11 @@ class SamplerSettings:
     """Rounds of importance sampling that shape the mixture."""
     draws: int = 1000
     """Draws from the mixture that the rounds arrived at, which are weighted."""
-    flat_rounds: int = 4
+    flat_rounds: int = 3
     """Rounds at most of mixtures in flat coordinates that follow (`flat_rounds`); 0 for none."""
     flat_worth: float = 50.0
     """Effective number of draws of the rounds so far with which the next one is the last."""
-    flat_starts: int = 2000
+    flat_starts: int = 1000
     """Draws at most from all over the prior, of which some that agree with the readings in contact
     set out to climb too,"""
     flat_enough: int = 300

@@ -47,7 +47,7 @@ class Blind:
     workers: int = 1
     """Processes that share the work on this machine."""
     quick: bool = False
-    """Three cases of 30 steps, for a smoke run."""
+    """Three cases of 20 steps, for a smoke run."""
     resume: bool = False
     """Go on with the cases that an earlier run in the folder did not finish."""
     overwrite: bool = False

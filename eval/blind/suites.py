@@ -98,7 +98,7 @@ SUITES = {
     "no_from_prior": Suite((CLEAN, *EFFECTS), without="from_prior"),
     "no_adequacy": Suite((CLEAN, *EFFECTS), without="adequacy"),
     "no_parity": Suite((CLEAN, *EFFECTS), without="parity"),
-    "quick": Suite((CLEAN, "force_bias", "floor_compliance"), steps=30),
+    "quick": Suite((CLEAN, "force_bias", "floor_compliance"), steps=20),
 }
 
 

@@ -13,7 +13,7 @@ from linear_model import DIMENSION, LinearModel
 from short_episode import short_episode
 
 from tpcd.belief import EstimatorSettings, SamplerSettings, refine
-from tpcd.belief.belief import EstimationStep
+from tpcd.belief.belief import EstimationStep, target_of
 from tpcd.belief.cloud import start_cloud
 from tpcd.belief.importance import assimilate
 from tpcd.belief.state import load_state
@@ -91,6 +91,14 @@ def test_the_closing_budget_has_the_particles_of_the_other_and_more_draws_for_ef
 def test_settings_without_meaning_are_refused(name: str, value: float, expected: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is .*, expected {expected}"):
         EstimatorSettings(**{name: value})
+
+
+def test_the_likelihood_counts_to_the_power_of_the_settings(
+    episode: Episode, estimator: Estimator
+) -> None:
+    for power in (0.5, 1.0):
+        settings = replace(SETTINGS, likelihood_power=power)
+        assert target_of(episode, estimator.shape, settings).power == power
 
 
 def test_it_draws_as_often_as_the_closing_budget_says_and_the_same_every_time(

@@ -109,6 +109,10 @@ class Sheared:
     def log_marginal(self, flat: Tensor) -> Tensor:
         return torch.zeros_like(flat[:, 0])
 
+    def likeliest(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        best = torch.cat((torch.zeros_like(flat[:, :1]), flat[:, 1:]), dim=-1)
+        return self.to_score(best)[0], self.log_marginal(flat)
+
 
 class Unchanged:
     """Coordinates that are the scores themselves."""
@@ -122,3 +126,6 @@ class Unchanged:
 
     def log_marginal(self, flat: Tensor) -> Tensor:
         return torch.zeros_like(flat[:, 0])
+
+    def likeliest(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        return flat, self.log_marginal(flat)

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from linear_model import DIMENSION, LinearModel
+from linear_model import DIMENSION, LinearModel, Unchanged
 from torch import Tensor
 
-from tpcd.belief.cloud import start_cloud
+from tpcd.belief.cloud import Counted, start_cloud
 from tpcd.belief.flat_mixture import WIDTHS, FlatMixture, flat_mixture
 from tpcd.belief.flat_start import flat_starts
 from tpcd.belief.importance import adapt, assimilate
@@ -151,7 +151,7 @@ def test_as_many_starts_are_drawn_as_there_need_be() -> None:
         own = found.draws.log_weights
         std = math.sqrt(1 / effective_sample_size(own.softmax(0)) - 1 / expected)
         assert std < 0.3 and abs(float(torch.logsumexp(own, 0)) - log_evidence) < 4 * std
-        assert 0 < len(found.points) <= settings.fresh_modes
+        assert 0 < len(found.points) <= settings.flat_climbers
 
 
 def test_those_climb_that_are_in_the_basin_of_a_narrow_mode() -> None:
@@ -164,13 +164,34 @@ def test_those_climb_that_are_in_the_basin_of_a_narrow_mode() -> None:
     target = model.target(2, peaked)
     weights = torch.full((500,), 1 / 500, dtype=torch.float64)
     coordinates = target.coordinates(start(), weights)
-    settings = replace(SETTINGS, flat_starts=2000, flat_enough=2000, fresh_modes=40)
-    found = flat_starts(target, coordinates, settings, torch.Generator().manual_seed(7))
-    scores = coordinates.to_score(found.draws.flat)[0]
-    of_all = (peaked(scores) > 0).double().mean()
+    settings = replace(SETTINGS, flat_starts=2000, flat_tried=2000, flat_climbers=40)
+    generator = torch.Generator().manual_seed(7)
+    found = flat_starts(target, coordinates, settings, generator)
+    everywhere = coordinates.likeliest(target.sample(2000, generator))[0]
+    of_all = (peaked(everywhere) > 0).double().mean()
     of_climbing = (peaked(found.points) > 0).double().mean()
     assert 0.001 < of_all < 0.1 and of_climbing > 4 * of_all
-    assert peaked(found.points).max() == peaked(scores).max() < 58
+    assert 10 < peaked(found.points).max() < 58
+
+
+class Pinned(Unchanged):
+    """The first score, whose square by ten thousand is what the readings say."""
+
+    def likeliest(self, flat: Tensor) -> tuple[Tensor, Tensor]:
+        return flat, -1e4 * flat[:, 0] ** 2
+
+
+def test_many_places_are_tried_however_much_the_readings_say() -> None:
+    """A hundredth of the places tells by a nat here; far more of them are to be tried."""
+    target = Counted(LinearModel(2).target(2))
+    settings = replace(SETTINGS, flat_tried=400, flat_climbers=400, flat_enough=1, flat_starts=2000)
+    counts = []
+    for coordinates in (Pinned(), Unchanged()):
+        before = target.evaluations
+        flat_starts(target, coordinates, settings, torch.Generator().manual_seed(3))
+        # Besides, all draws are weighed, and the first of them twice.
+        counts.append(target.evaluations - before - 2000 - settings.fresh_modes)
+    assert counts[1] == 400 and 200 < counts[0] < 400
 
 
 def test_the_same_generator_gives_the_same_draws() -> None:

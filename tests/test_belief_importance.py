@@ -270,6 +270,8 @@ def test_evidence_is_not_biased_by_the_places_chosen() -> None:
         {"climbing_rounds": -1},
         {"flat_rounds": -1},
         {"flat_starts": 0},
+        {"flat_tried": 0},
+        {"flat_climbers": 0},
         {"flat_draws": 10},
     ],
 )

@@ -30,6 +30,11 @@ class Coordinates(Protocol):
         """About the log likelihood (m) of the others, but for a constant."""
         ...
 
+    def likeliest(self, flat: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Scores (m, d) of the others with about the likeliest entries that the prior allows, and
+        about their log likelihood (m), but for a constant; -inf where there is none."""
+        ...
+
     def to_score(self, flat: Tensor, /) -> tuple[Tensor, Tensor]:
         """Scores (m, d), and log |d score / d flat| (m); infinite scores have no prior density."""
         ...

@@ -2,8 +2,9 @@
 
 Where the data pin some entries given the others (`Coordinates.entries`), draws from all over the
 prior whose entries are standard normal agree with the readings already: a few of them show where
-all of the posterior lies, however many pieces it has. A narrow mode is met by none of them; those
-in its basin show by their weights where it is worth climbing.
+all of the posterior lies, however many pieces it has. A narrow mode is met by none of them, and
+where readings tell outlines apart, hardly any has its entries inside the prior's box. Modes are
+therefore looked for from places where the entries are the best that the box allows.
 """
 
 from __future__ import annotations
@@ -16,17 +17,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.cloud import Coordinates, Target
-from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.modes import log_target
+from tpcd.belief.resampling import effective_sample_size, systematic_resample
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.weights import TRUSTED, finite, known_weights, threshold
 
 _AT_ONCE = 2000
+_LESS = 0.7
+"""Factor between the powers that are tried."""
 _POWER = 0.3
 """Power of what the readings say about the rest, by which the first ones to be weighed are chosen:
 they lie further apart than the posterior."""
-_CLIMBING_POWER = 0.1
-"""Power of the weights by which those are chosen that climb. The basin of a narrow mode is far
-below its top, and above its surroundings."""
+_TRYING_POWER = 0.1
+"""Power at most of what the readings say about the best entries, by which places are tried, """
+_CLIMBING_POWER = 0.2
+"""and of the posterior there, by which those are chosen that climb. The basin of a narrow mode is
+far below its top, and above its surroundings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ class FlatStart:
     draws: FlatDraws
     """From all over the prior, where they agree with the readings in contact."""
     points: Float[Tensor, "f d"]
-    """Some of them (scores), from which to look for modes."""
+    """Scores from which to look for modes."""
 
 
 def flat_starts(
@@ -71,7 +77,7 @@ def flat_starts(
     settings: SamplerSettings,
     generator: torch.Generator,
 ) -> FlatStart:
-    """Draws from all over the prior; few where the readings leave the boxes."""
+    """Draws from all over the prior, few where the readings leave the boxes, and where to climb."""
     drawn, flat, score, log_slope = _inside(target, coordinates, settings, generator)
     log_prior = target.log_prior(score)
     log_sum = log_start(coordinates, flat, score, log_prior) + math.log(drawn)
@@ -89,11 +95,35 @@ def flat_starts(
         least[first] = torch.inf
         others = finite(log_prior + target.log_likelihood(score, least))
         draws = replace(draws, log_target=torch.maximum(log_target, others))
-    climbing = first
-    if bool((draws.log_weights > -torch.inf).any()):
-        weights = known_weights(_CLIMBING_POWER * draws.log_weights)
-        climbing = systematic_resample(weights, settings.fresh_modes, generator).unique()
-    return FlatStart(coordinates, draws, score[climbing])
+    return FlatStart(coordinates, draws, _climbers(target, coordinates, settings, generator))
+
+
+def _climbers(
+    target: Target,
+    coordinates: Coordinates,
+    settings: SamplerSettings,
+    generator: torch.Generator,
+) -> Tensor:
+    """Scores from which to look for modes: draws of the others, with the best entries."""
+    score, likely = coordinates.likeliest(target.sample(settings.flat_starts, generator))
+    weights = _tempered(likely, settings.flat_tried)
+    tried = score[systematic_resample(weights, settings.flat_tried, generator).unique()]
+    height = log_target(target, tried)
+    if not bool((height > -torch.inf).any()):
+        return tried[: settings.flat_climbers]
+    weights = known_weights(_CLIMBING_POWER * height)
+    return tried[systematic_resample(weights, settings.flat_climbers, generator).unique()]
+
+
+def _tempered(log_weights: Tensor, count: int) -> Tensor:
+    """Weights to a power with which they are worth about half of so many draws."""
+    power = _TRYING_POWER
+    enough = 0.5 * min(count, int((log_weights > -torch.inf).sum()))
+    weights = known_weights(power * log_weights)
+    while effective_sample_size(weights) < enough:
+        power *= _LESS
+        weights = known_weights(power * log_weights)
+    return weights
 
 
 def _inside(

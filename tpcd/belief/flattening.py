@@ -30,6 +30,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tpcd.belief.box import nearest_inside
 from tpcd.belief.contact_rows import (
     LINEAR,
     offset_signs,
@@ -43,6 +44,9 @@ from tpcd.belief.prior import ParameterPrior
 from tpcd.planar import rotate
 from tpcd.simulator import native
 
+INSIDE = 0.02
+"""How far inside the box the likeliest six are, as a share of its widths: at the edge, scores are
+infinite."""
 FAR_OFF = 3.0
 """Mean deviations that points may be off a row."""
 LARGEST_MISFIT = 0.1
@@ -137,6 +141,19 @@ class Flattening:
     def log_marginal(self, flat: Float[Tensor, "m d"]) -> Float[Tensor, " m"]:
         """How likely the rest is by what the readings say about the six, but for a constant."""
         return self._conditional(flat)[2]
+
+    def likeliest(
+        self, flat: Float[Tensor, "m d"]
+    ) -> tuple[Float[Tensor, "m d"], Float[Tensor, " m"]]:
+        """Scores of the rest with the six that the readings make likeliest inside their box, and
+        how likely that is, but for a constant."""
+        mean, factor, marginal = self._conditional(flat)
+        low, width = self._box
+        precision = (factor @ factor.mT) * width[:, None] * width
+        place, cost = nearest_inside((mean - low) / width, precision, INSIDE)
+        score = flat.clone()
+        score[:, self.entries] = torch.special.ndtri(place)
+        return score, marginal - cost
 
     def _conditional(self, score: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (m, 6) of the six given the rest, the Cholesky factor of their precision, and the

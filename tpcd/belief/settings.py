@@ -28,10 +28,13 @@ class SamplerSettings:
     flat_worth: float = 50.0
     """Effective number of draws of the rounds so far with which the next one is the last."""
     flat_starts: int = 1000
-    """Draws at most from all over the prior, of which some that agree with the readings in contact
-    set out to climb too,"""
+    """Draws at most from all over the prior, and as many places to look for modes from,"""
     flat_enough: int = 300
-    """and how many that agree are enough."""
+    """how many draws that agree with the readings in contact are enough,"""
+    flat_tried: int = 100
+    """how many of those places are tried,"""
+    flat_climbers: int = 16
+    """and how many of these set out to climb."""
     flat_draws: int = 300
     """Draws of each flat round but the last."""
     prior_draws: int = 200
@@ -56,6 +59,8 @@ class SamplerSettings:
             "flat_worth": 0,
             "flat_starts": 1,
             "flat_enough": 1,
+            "flat_tried": 1,
+            "flat_climbers": 1,
             "flat_draws": 100,
             "draws": 100,
             "prior_draws": 1,
@@ -76,13 +81,14 @@ CLOSING_SAMPLER = SamplerSettings(
     draws=20_000,
     flat_rounds=8,
     flat_worth=math.inf,
-    flat_starts=100_000,
-    flat_enough=30_000,
+    flat_starts=60_000,
+    flat_enough=10_000,
+    flat_tried=6000,
+    flat_climbers=960,
     flat_draws=3000,
     prior_draws=1500,
     modes=40,
-    fresh_modes=480,
-    climbing_rounds=4,
+    fresh_modes=960,
 )
 """Budget of the belief that is left once no more data are to come."""
 

@@ -192,7 +192,7 @@ def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
 
     whole = conditions(history)
     assert whole.give.abs().max() > 1e-4
-    for k in range(len(history) - 1):
+    for k in range(len(history) - 1) if compiled else (1, 3):
         left_out = conditions(history.using(torch.arange(len(history)) != k))
         for name in ("give", "offset"):
             torch.testing.assert_close(

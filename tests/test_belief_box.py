@@ -12,7 +12,7 @@ from tpcd.belief.box import nearest_inside
 
 
 def problems(count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
-    """Means in and out of the unit box, and precisions of condition up to a million."""
+    """Means in and out of the unit box, and precisions of condition up to some millions."""
     generator = torch.Generator().manual_seed(3)
     mean = 0.5 + torch.randn(count, 5, generator=generator, dtype=torch.float64)
     factor = torch.randn(count, 5, 5, generator=generator, dtype=torch.float64)

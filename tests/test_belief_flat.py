@@ -175,14 +175,14 @@ def test_those_climb_that_are_in_the_basin_of_a_narrow_mode() -> None:
 
 
 class Pinned(Unchanged):
-    """The first score, whose square by ten thousand is what the readings say."""
+    """The readings say minus ten thousand times the square of the first score."""
 
     def likeliest(self, flat: Tensor) -> tuple[Tensor, Tensor]:
         return flat, -1e4 * flat[:, 0] ** 2
 
 
 def test_many_places_are_tried_however_much_the_readings_say() -> None:
-    """A hundredth of the places tells by a nat here; far more of them are to be tried."""
+    """Only a hundredth of the places is within a nat of the best; far more are to be tried."""
     target = Counted(LinearModel(2).target(2))
     settings = replace(SETTINGS, flat_tried=400, flat_climbers=400, flat_enough=1, flat_starts=2000)
     counts = []

@@ -1,4 +1,8 @@
-"""The likeliest place in a box."""
+"""The likeliest places in a unit box, of normal densities whose means may lie outside.
+
+Axes: m densities, d entries. Each is a contact problem (`tpcd.qp`) with the sides of the box as
+its one-sided rows.
+"""
 
 from __future__ import annotations
 

@@ -41,6 +41,7 @@ from tpcd.belief.contact_rows import (
 from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
+from tpcd.belief.weights import finite
 from tpcd.planar import rotate
 from tpcd.simulator import native
 
@@ -145,15 +146,15 @@ class Flattening:
     def likeliest(
         self, flat: Float[Tensor, "m d"]
     ) -> tuple[Float[Tensor, "m d"], Float[Tensor, " m"]]:
-        """Scores of the rest with the six that the readings make likeliest inside their box, and
-        how likely that is, but for a constant."""
+        """Scores of the rest with the six inside their box that are likeliest by the readings and
+        the prior, taken for a normal, and how likely they are, but for a constant."""
         mean, factor, marginal = self._conditional(flat)
         low, width = self._box
         precision = (factor @ factor.mT) * width[:, None] * width
         place, cost = nearest_inside((mean - low) / width, precision, INSIDE)
         score = flat.clone()
         score[:, self.entries] = torch.special.ndtri(place)
-        return score, marginal - cost
+        return score, finite(marginal - cost)
 
     def _conditional(self, score: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (m, 6) of the six given the rest, the Cholesky factor of their precision, and the

@@ -4,9 +4,9 @@ After each transition the sampler spends little, which is enough to choose the n
 is left of an episode is the belief after its last transition, and that one may cost more: with ten
 data the draws of `budget` are worth about ten, and whole pieces of the posterior are without one.
 
-Draws in flat coordinates from all over the prior say where the posterior has its pieces, and
-mixtures there (`flat_rounds`) meet them. Where the draws are worth little all the same, further
-mixtures begin at them.
+Draws in flat coordinates from all over the prior, and the modes that are climbed to, say where the
+posterior has its pieces (`flat_start`), and mixtures there (`flat_rounds`) meet them. Where the
+draws are worth little all the same, further mixtures begin at them.
 """
 
 from __future__ import annotations

@@ -32,9 +32,9 @@ class SamplerSettings:
     flat_enough: int = 300
     """how many draws that agree with the readings in contact are enough,"""
     flat_tried: int = 100
-    """how many of those places are tried,"""
+    """how many of those places at most are tried,"""
     flat_climbers: int = 16
-    """and how many of these set out to climb."""
+    """and how many of these at most set out to climb."""
     flat_draws: int = 300
     """Draws of each flat round but the last."""
     prior_draws: int = 200
@@ -42,7 +42,8 @@ class SamplerSettings:
     modes: int = 8
     """Modes that are remembered from datum to datum."""
     fresh_modes: int = 8
-    """Points that set out to climb to a mode at each datum."""
+    """Points from all over the prior that set out to climb to a mode at each datum, besides
+    `flat_climbers`."""
     climbing_rounds: int = 2
     """Newton steps before the lower half of those gives up."""
     following_rounds: int = 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -55,9 +55,14 @@ class LinearTarget:
     model: LinearModel
     count: int
     likelihood: Likelihood
+    roughly: Likelihood | None = None
+    """Likelihood of what is rough, where it is another one."""
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         return torch.randn(count, DIMENSION, generator=generator, dtype=torch.float64)
+
+    def rough(self) -> LinearTarget:
+        return replace(self, likelihood=self.roughly or self.likelihood)
 
     def scatter(self, count: int, generator: torch.Generator) -> Tensor:
         return self.sample(count, generator)
@@ -74,7 +79,10 @@ class LinearTarget:
         information = torch.eye(DIMENSION).double() + rows.T @ rows / NOISE**2
         return gradient, information.expand(len(x), -1, -1)
 
-    def coordinates(self, x: Tensor, weights: Tensor) -> Sheared:
+    def log_likelihood_and_contact(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.log_likelihood(x, None), x[:, :0]
+
+    def coordinates(self, x: Tensor, weights: Tensor, contact: Tensor) -> Sheared:
         information = self.curvature(x[:1])[1][0]
         centre = self.model.posterior(self.count)[0]
         return Sheared(centre, information)

@@ -124,6 +124,32 @@ def test_the_linear_normal_posterior_and_its_evidence_come_out() -> None:
     assert second.effective_sample_size > 3000
 
 
+@pytest.mark.parametrize("rough", [True, False])
+def test_what_is_rough_shapes_the_draws_and_does_not_weigh_them(rough: bool) -> None:
+    """A rough likelihood that lacks all but the first datum costs draws, and moves nothing."""
+    model = LinearModel(5, seed=4)
+    target = replace(model.target(5), roughly=model.target(1).likelihood)
+    settings, generator = replace(SETTINGS, rough=rough), torch.Generator().manual_seed(3)
+    adapted = adapt(start_cloud(start()), target, 5, settings, generator)
+    pool = adapted.pool(target, 8000, generator)
+    known_moments(pool, model, 5)
+    assert (pool.effective_sample_size < 0.8 * plain_worth(model)) == rough
+
+
+def plain_worth(model: LinearModel) -> float:
+    generator = torch.Generator().manual_seed(3)
+    target = model.target(5)
+    adapted = adapt(start_cloud(start()), target, 5, SETTINGS, generator)
+    return adapted.pool(target, 8000, generator).effective_sample_size
+
+
+def test_a_long_history_has_fewer_draws() -> None:
+    settings = SamplerSettings(draws=1000, flat_draws=150, full_draws=10)
+    found = [(each.draws, each.flat_draws) for each in map(settings.after, (1, 10, 16, 20, 500))]
+    assert found == [(1000, 150), (1000, 150), (625, 100), (500, 100), (500, 100)]
+    assert replace(settings.after(16), draws=1000, flat_draws=150) == settings
+
+
 def test_rounds_end_once_their_draws_are_worth_enough() -> None:
     model = LinearModel(5, seed=4)
     target = model.target(5)
@@ -143,7 +169,7 @@ def test_as_many_starts_are_drawn_as_there_need_be() -> None:
     model = LinearModel(5, seed=4)
     target, log_evidence = model.target(5), model.posterior(5)[2]
     weights = torch.full((500,), 1 / 500, dtype=torch.float64)
-    coordinates = target.coordinates(start(), weights)
+    coordinates = target.coordinates(start(), weights, start()[:, :0])
     for most, needed, expected in ((50_000, 1000, 2000), (50_000, 3000, 4000), (1500, 3000, 1500)):
         settings = replace(SETTINGS, flat_starts=most, flat_enough=needed)
         found = flat_starts(target, coordinates, settings, torch.Generator().manual_seed(1))
@@ -163,7 +189,7 @@ def test_those_climb_that_are_in_the_basin_of_a_narrow_mode() -> None:
 
     target = model.target(2, peaked)
     weights = torch.full((500,), 1 / 500, dtype=torch.float64)
-    coordinates = target.coordinates(start(), weights)
+    coordinates = target.coordinates(start(), weights, start()[:, :0])
     settings = replace(SETTINGS, flat_starts=2000, flat_tried=2000, flat_climbers=40)
     generator = torch.Generator().manual_seed(7)
     found = flat_starts(target, coordinates, settings, generator)

@@ -50,7 +50,13 @@ class ThreeModes:
         gradient = (CENTRES[nearest] - x) / WIDTH**2
         return gradient, torch.eye(DIMENSION).double().expand(len(x), -1, -1) / WIDTH**2
 
-    def coordinates(self, x: Tensor, weights: Tensor) -> Unchanged:
+    def log_likelihood_and_contact(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.log_likelihood(x, None), x[:, :0]
+
+    def rough(self) -> ThreeModes:
+        return self
+
+    def coordinates(self, x: Tensor, weights: Tensor, contact: Tensor) -> Unchanged:
         return Unchanged()
 
 

@@ -48,6 +48,10 @@ class Coordinates(Protocol):
 class Target(Protocol):
     """A log posterior in unconstrained coordinates (m, d) of prior standard deviation 1."""
 
+    def rough(self) -> Target:
+        """About the same, and cheaper: good enough to find where the posterior is."""
+        ...
+
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws (count, d) from the prior."""
         ...
@@ -70,7 +74,11 @@ class Target(Protocol):
         posterior. Only proposals depend on them, so they need not be exact."""
         ...
 
-    def coordinates(self, positions: Tensor, weights: Tensor, /) -> Coordinates:
+    def log_likelihood_and_contact(self, positions: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Log likelihood (m) of the history, and what `coordinates` asks about contact (m, ...)."""
+        ...
+
+    def coordinates(self, positions: Tensor, weights: Tensor, contact: Tensor, /) -> Coordinates:
         """Coordinates that suit a posterior which positions (m, d) and weights (m) stand for."""
         ...
 
@@ -81,6 +89,10 @@ class Counted:
 
     target: Target
     evaluations: int = 0
+
+    def rough(self) -> Target:
+        """Of the target, counted on its own from here on."""
+        return Counted(self.target.rough(), self.evaluations)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Of the target."""
@@ -104,10 +116,14 @@ class Counted:
         self.evaluations += CURVATURE_COST * len(positions)
         return self.target.curvature(positions)
 
-    def coordinates(self, positions: Tensor, weights: Tensor) -> Coordinates:
+    def log_likelihood_and_contact(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Of the target."""
         self.evaluations += len(positions)
-        return self.target.coordinates(positions, weights)
+        return self.target.log_likelihood_and_contact(positions)
+
+    def coordinates(self, positions: Tensor, weights: Tensor, contact: Tensor) -> Coordinates:
+        """Of the target."""
+        return self.target.coordinates(positions, weights, contact)
 
 
 @dataclass(frozen=True)

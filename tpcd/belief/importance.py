@@ -52,6 +52,7 @@ def assimilate(
 
     Raises ValueError where no particle can explain the datum at all.
     """
+    settings = settings.after(datum)
     pool = draw_pool(cloud, target, datum, settings, generator)
     after = pool.cloud(settings.particles, generator)
     return after, pool.info(settings.rounds, len(after.weights))
@@ -79,11 +80,13 @@ def adapt(
 ) -> Adapted:
     """A proposal that starts at the cloud and the modes, and goes to where the weight is."""
     target = Counted(target)
-    log_likelihood, brought_on = _brought_on(cloud, target)
-    brought_on = known_weights(brought_on)
+    # The particles were weighed by the exact one before.
+    log_likelihood, contact = target.log_likelihood_and_contact(cloud.positions)
+    brought_on = known_weights(_brought_on(cloud, log_likelihood))
+    target = target.rough() if settings.rough else target
     begun = None
     if settings.flat_rounds:
-        coordinates = target.coordinates(cloud.positions, brought_on)
+        coordinates = target.coordinates(cloud.positions, brought_on, contact)
         begun = flat_starts(target, coordinates, settings, generator)
     fresh = None if begun is None else begun.points
     peaks = find_modes(target, cloud.modes, settings, generator, fresh)
@@ -144,7 +147,7 @@ class Adapted:
     ) -> Adapted:
         """With further mixtures in flat coordinates, which begin at the draws of a pool."""
         assert self.proposal.flat is not None
-        target = Counted(target, pool.evaluations)
+        target = Counted(target.rough() if settings.rough else target, pool.evaluations)
         flat = self.proposal.flat.begun(pool.positions, pool.log_weights)
         flat = adapt_flat(target, flat, settings, generator)
         proposal = replace(self.proposal, flat=flat)
@@ -211,14 +214,13 @@ def _of_prior(target: Target, count: int, generator: torch.Generator) -> _Draws:
     return _Draws(positions, log_prior, log_likelihood, log_prior + math.log(count), None, count)
 
 
-def _brought_on(cloud: Cloud, target: Target) -> tuple[Tensor, Tensor]:
-    """Log likelihoods of the particles with the new datum, and their log weights."""
-    log_likelihood = target.log_likelihood(cloud.positions, None)
+def _brought_on(cloud: Cloud, log_likelihood: Tensor) -> Tensor:
+    """Log weights of the particles with the new datum, from their log likelihoods with it."""
     gain = log_likelihood - cloud.log_likelihood
     log_weights = torch.where(torch.isfinite(gain), gain, -torch.inf) + cloud.weights.log()
     # Where nobody explains it, those of the history before.
     some = bool(torch.isfinite(log_weights).any())
-    return log_likelihood, log_weights if some else cloud.weights.log()
+    return log_weights if some else cloud.weights.log()
 
 
 def _follow(

@@ -48,6 +48,11 @@ class SamplerSettings:
     """Newton steps before the lower half of those gives up."""
     following_rounds: int = 3
     """Newton steps of the modes that are remembered, and of those that did not give up."""
+    rough: bool = True
+    """Whether all but the draws that count are of `Target.rough`."""
+    full_draws: int = 10
+    """Datum up to which `draws` and `flat_draws` are as many as that. They fall as 1 / k with a
+    later datum k, to half, since each takes k transitions to weigh."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
@@ -69,10 +74,17 @@ class SamplerSettings:
             "fresh_modes": 1,
             "climbing_rounds": 0,
             "following_rounds": 0,
+            "full_draws": 1,
         }
         for name, limit in least.items():
             if not getattr(self, name) >= limit:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
+
+    def after(self, datum: int) -> SamplerSettings:
+        """The budget that datum 1, 2, ... has."""
+        share = min(1.0, max(0.5, self.full_draws / datum))
+        draws, flat_draws = (max(100, round(share * n)) for n in (self.draws, self.flat_draws))
+        return replace(self, draws=draws, flat_draws=flat_draws)
 
 
 CLOSING_SAMPLER = SamplerSettings(
@@ -90,6 +102,7 @@ CLOSING_SAMPLER = SamplerSettings(
     prior_draws=1500,
     modes=40,
     fresh_modes=960,
+    rough=False,
 )
 """Budget of the belief that is left once no more data are to come."""
 

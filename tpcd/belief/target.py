@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.belief.filtered import HistoryLikelihood
@@ -44,6 +44,11 @@ class ContactTarget:
     def given(self, history: History) -> ContactTarget:
         """The same with a history."""
         return replace(self, history=history)
+
+    def rough(self) -> ContactTarget:
+        """With paths of commands that are not followed to where contact changes, which takes 0.6 of
+        the time."""
+        return replace(self, step=replace(self.step, finest=1.0))
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "m s"]:
         """Draws from the prior, whose shapes are not checked: what a belief holds in the end is."""
@@ -141,19 +146,29 @@ class ContactTarget:
         still = torch.zeros_like(slopes[0])
         return _Linearised(whitened, torch.cat(slopes, 1), torch.cat((still, *stretch), 1))
 
+    def log_likelihood_and_contact(
+        self, score: Float[Tensor, "m s"]
+    ) -> tuple[Float[Tensor, " m"], Int[Tensor, "m n t"]]:
+        """Log likelihood of the history, times the power, and the contact of each transition with
+        each terrain (`ContactMode`)."""
+        found = self.evaluate(score, steps=True)
+        assert found.steps is not None
+        return self.power * found.total, found.steps.mode
+
     def coordinates(
-        self, positions: Float[Tensor, "m s"], weights: Float[Tensor, " m"]
+        self,
+        positions: Float[Tensor, "m s"],
+        weights: Float[Tensor, " m"],
+        contact: Int[Tensor, "m n t"],
     ) -> Flattening:
         """Those in which the sheet lies flat, if contact is what most of the weight says it is."""
         assert self.history is not None
         # Draws of no weight say nothing, and there can be many.
         some = weights > _LEAST_WEIGHT * weights.max()
-        steps = self.evaluate(positions[some], steps=True).steps
-        assert steps is not None
         share = weights[some] / weights[some].sum()
         modes = (int(ContactMode.FREE), int(ContactMode.STICK))
         free, stuck = (
-            torch.einsum("m,mnt->nt", share, (steps.mode == mode).double()) for mode in modes
+            torch.einsum("m,mnt->nt", share, (contact[some] == mode).double()) for mode in modes
         )
         found = flattening(self.prior, self.misfit, self.history, free < 0.5, stuck > 0.5)
         return found.consistent(positions[some], share)

@@ -30,6 +30,7 @@ FIT_SAMPLER = SamplerSettings(
     rounds=3,
     draws=2000,
     flat_rounds=0,
+    rough=False,
     prior_draws=500,
     modes=20,
     fresh_modes=120,

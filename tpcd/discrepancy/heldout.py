@@ -36,6 +36,7 @@ FOLD_SAMPLER = SamplerSettings(
     rounds=2,
     draws=1000,
     flat_rounds=0,
+    rough=False,
     prior_draws=100,
     modes=12,
     fresh_modes=24,

@@ -44,7 +44,6 @@ class Estimate:
 def estimate_episode(config: Estimate) -> None:
     """Estimate the contact model from an episode and write the belief to a run folder."""
     import sys
-    from contextlib import nullcontext
     from shlex import quote
 
     import torch
@@ -54,11 +53,18 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
-    from tpcd.commands.plausibility import check_start_pose
+    from tpcd.commands.plausibility import check_start_after, check_start_pose
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
+    from tpcd.errors import RunError
     from tpcd.exploration import Estimator
-    from tpcd.results import continue_run, format_table, run_folder, write_results
+    from tpcd.results import (
+        RESULTS_FILE,
+        format_table,
+        resumed_run,
+        run_folder,
+        write_results,
+    )
     from tpcd.shape.checkpoint import load_prior
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
@@ -70,10 +76,12 @@ def estimate_episode(config: Estimate) -> None:
     for warning in check_episode(episode):
         print(f"warning: {warning}", file=sys.stderr)
     if config.resume:
+        if (config.out / RESULTS_FILE).is_file():
+            raise RunError(config.out, "is finished", "leave out --resume and name a new folder")
         check_kept_model(model, config.out)
         # The state knows its data and the run its model, so files may have been moved.
-        free = ("episode", "model", "out", "resume", "overwrite")
-        opened = nullcontext(continue_run(config.out, config, free))
+        free = ("episode", "model", "out", "resume")
+        opened = resumed_run(config.out, config, free)
     else:
         opened = run_folder(
             config.out, "scripts/estimate.py", config, config.overwrite, resumable=STATE_FILE
@@ -98,6 +106,7 @@ def estimate_episode(config: Estimate) -> None:
         with SummaryWriter(folder / "tensorboard") as writer:
             writer.add_text("table", f"```\n{text}\n```")
         write_results(folder, table, seeds=[config.seed])
+    check_start_after(episode, belief)
     print(
         f"\nresults in {config.out}; next: python scripts/predict.py {quote(str(config.out))}"
         " EPISODE --out FILE.csv"

@@ -18,7 +18,8 @@ class Predict:
     episodes: tuple[Path, ...]
     """Episodes to predict, one or more."""
     out: Path
-    """File for the predictions, .csv or .parquet."""
+    """File for the predictions, .csv or .parquet: step, then x_mean, x_sd, x_q05, x_q95 and the
+    same of z, phi, F_x, F_z, tau; of several episodes a column episode (0, 1, ...) comes first."""
     model: Path | None = None
     """A model.yaml whose effects join the belief, drawn from what it says was found."""
     rollout: bool = False
@@ -72,8 +73,6 @@ def predict_episodes(config: Predict) -> None:
         raise RunError(config.out, "is no .csv or .parquet", "choose a name that ends so")
     model = model_of(config.model)
     belief = load_belief(config.run)
-    for warning in run_warnings(config.run, episodes):
-        print(f"warning: {warning}", file=sys.stderr)
     for path, episode in zip(config.episodes, episodes, strict=True):
         if not torch.allclose(episode.stiffness, belief.stiffness):
             raise RunError(
@@ -83,6 +82,8 @@ def predict_episodes(config: Predict) -> None:
                 "predict episodes recorded with the same controller",
             )
         check_start_of(episode, belief)
+    for warning in run_warnings(config.run, episodes):
+        print(f"warning: {warning}", file=sys.stderr)
     generator = torch.Generator().manual_seed(config.seed)
     if config.model is not None:
         try:

@@ -127,6 +127,8 @@ class Simulation:
 
 def simulate(config: Simulation) -> None:
     """Simulate episodes of an object in the hand that touches a floor and a wall."""
+    import sys
+
     import torch
 
     from tpcd.data.files import write_together
@@ -154,8 +156,6 @@ def simulate(config: Simulation) -> None:
         stiffness=config.stiffness,
         start_pose=config.start or None,
     )
-    theta = " · ".join(f"{name} {value:.4g}" for name, value in scene.theta.items())
-    print(f"{outline.name}: {theta}")
     position, angle = config.noise_position, config.noise_angle
     force, torque = config.noise_force, config.noise_torque
     sensor_std = torch.tensor(
@@ -178,7 +178,10 @@ def simulate(config: Simulation) -> None:
             f" {recording.settled.count(False)} did not settle"
         )
     write_together(contents, config.overwrite)
-    print("\n".join(lines))
+    if Path(config.outline).suffix and outline.notes:
+        print(f"note: {config.outline}: {outline.notes}", file=sys.stderr)
+    theta = " · ".join(f"{name} {value:.4g}" for name, value in scene.theta.items())
+    print("\n".join((f"{outline.name}: {theta}", *lines)))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import torch
 from command_calls import PRIOR, call, make_world
 
 from tpcd.belief.storage import load_belief
+from tpcd.commands.drawing import central_outline
 from tpcd.data import read_episode, write_episode
 from tpcd.data.table import read_table
 
@@ -184,3 +185,14 @@ def test_a_belief_that_few_draws_carry_is_warned_of(
     warning = few_draws_warning(row)
     assert (warning is not None) == bool(told)
     assert told in (warning or "")
+
+
+def test_the_outline_in_the_scene_is_a_central_one() -> None:
+    """Not the first of equal weights, and where weight gathers."""
+    angles = torch.linspace(0, 2 * torch.pi, 33, dtype=torch.float64)[:-1]
+    circle = torch.stack((angles.cos(), angles.sin()), -1)
+    radii = torch.tensor([0.01, 0.05, 0.051, 0.052, 0.09], dtype=torch.float64)
+    outlines = radii[:, None, None] * circle
+    for weights, expected in (([1.0] * 5, 2), ([0.1, 0.1, 0.1, 0.1, 9.0], 4)):
+        found = central_outline(outlines, torch.tensor(weights, dtype=torch.float64))
+        torch.testing.assert_close(found, outlines[expected])

@@ -130,15 +130,39 @@ def test_an_estimate_interrupted_after_a_step_goes_on(world, tmp_path, monkeypat
         yield next(iter(estimate(*arguments)))
         raise KeyboardInterrupt
 
+    def stopped(estimator):
+        raise KeyboardInterrupt
+
     whole, out = tmp_path / "whole", tmp_path / "run"
     assert call("estimate", *estimate_arguments(world, whole)) == 0
     with monkeypatch.context() as patch:
         patch.setattr("tpcd.exploration.estimate", interrupted)
         assert call("estimate", *estimate_arguments(world, out)) == 130
     assert "run goes on with --resume" in capsys.readouterr().err
-    assert call("estimate", *estimate_arguments(world, out), "--resume") == 0
+    again, resumed = estimate_arguments(world, out), (*estimate_arguments(world, out), "--resume")
+    line = refused(capsys, world, "estimate", *again)
+    assert "run: is not empty; go on with --resume, name a new folder or pass --overwrite" in line
+    with monkeypatch.context() as patch:
+        patch.setattr("tpcd.exploration.Estimator.closing", property(stopped))
+        assert call("estimate", *resumed) == 130
+    assert "run goes on with --resume" in capsys.readouterr().err
+    line = refused(capsys, world, "estimate", *resumed, "--overwrite")
+    assert "run: is to be resumed and overwritten; leave out one of the two" in line
+    assert call("estimate", *resumed) == 0
     results = [json.loads((run / "results.json").read_text()) for run in (whole, out)]
     assert results[0]["table"] == results[1]["table"]
+    assert "run: is finished; leave out --resume" in refused(capsys, world, "estimate", *resumed)
+
+
+def test_a_start_pose_that_its_own_rows_contradict_is_told(world, tmp_path, capsys) -> None:
+    """35 mm lower it is free under some prior draws, and inside the floor that was touched."""
+    rows = (world / "explore.csv").read_text().splitlines()
+    z = float(rows[1].split(",")[rows[0].split(",").index("z")]) - 0.035
+    path = changed_episode(world, tmp_path, 0, {"z": z, "u_z": z})
+    assert call("estimate", str(path), *estimate_arguments(world, tmp_path / "run")[1:]) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "changed.csv: row 0 (line 2)" in line and "mm inside the floor for all" in line
+    assert "not to be trusted" in line and (tmp_path / "run" / "results.json").is_file()
 
 
 PREDICT = {
@@ -206,6 +230,8 @@ SIMULATE = {
     "name with a folder": ({"--name": "../x"}, "name is '../x', expected a file name"),
     "negative seed": ({"--seed": "-1"}, "seed is -1"),
     "episode in the way": ({"--name": "there"}, "there.yaml: exists already"),
+    "unknown effect": ({"--effects": "foo.bar=1"}, "no effect 'foo'"),
+    "unit of a name": ({"--unit": "mm"}, "unit is 'mm', expected none for 'mug', which is no file"),
     "file in the way": ({"--out": "cross.csv"}, "is a file"),
 }
 
@@ -227,6 +253,19 @@ def test_an_outline_in_its_own_unit_is_simulated(tmp_path) -> None:
     words = ("--outline", str(tmp_path / "mm.csv"), "--unit", "mm", "--truth", "quasistatic")
     assert call("simulate", *words, "--steps", "1", "--out", str(tmp_path / "data")) == 0
     assert (tmp_path / "data" / "rich.csv").is_file()
+
+
+def test_what_is_left_out_of_an_outline_is_told(tmp_path, capsys) -> None:
+    ring = "M0,0 L90,0 L90,90 L0,90 Z M30,30 L60,30 L60,60 L30,60 Z"
+    (tmp_path / "ring.svg").write_text(
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="90mm" height="90mm" viewBox="0 0 90 90">'
+        f'<path d="{ring}"/></svg>'
+    )
+    words = ("--outline", str(tmp_path / "ring.svg"), "--truth", "quasistatic", "--steps", "1")
+    assert call("simulate", *words, "--out", str(tmp_path / "data")) == 0
+    told = capsys.readouterr()
+    assert "ring.svg: loops inside its outline, holes perhaps: 1, filled" in told.err
+    assert told.out.startswith("ring: scale")
 
 
 FETCH = {

@@ -108,7 +108,7 @@ def test_a_run_of_another_network_is_not_resumed(
 ) -> None:
     assert call(*ARGUMENTS, "--network.width=32", f"--out={run}", "--resume") == 2
     message = capsys.readouterr().err.strip()
-    assert "holds a run with another network" in message and "\n" not in message
+    assert "holds a run whose network is not the same" in message and "\n" not in message
 
 
 def test_resuming_from_nothing_is_refused_in_one_line(

@@ -90,7 +90,7 @@ def test_holes_are_filled_and_only_the_largest_loop_is_kept():
     assert outline.area == pytest.approx(np.pi * 0.05**2, rel=0.02)
     upright = cut_mesh(ring, "ring", plane())
     assert upright.size == pytest.approx((0.03, 0.03), rel=0.02)
-    assert "1 further pieces, 100% of the area" in upright.notes
+    assert "1 further piece, 100% of the largest one's area" in upright.notes
 
 
 def test_a_cup_is_closed_only_on_request():

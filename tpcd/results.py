@@ -58,7 +58,7 @@ def run_folder(
     """
     folder = Path(path).absolute()
     aside = folder.with_name(f".{folder.name}.{os.getpid()}.earlier")
-    replacing = _holds_run(Path(path), overwrite)
+    replacing = _holds_run(Path(path), overwrite, resumable)
     if replacing:
         _spare_inputs(Path(path), config)
     was_there = folder.is_dir() and not replacing
@@ -71,8 +71,7 @@ def run_folder(
         if resumable and (folder / resumable).exists():
             shutil.rmtree(aside, ignore_errors=True)
             if isinstance(error, KeyboardInterrupt):
-                said = f"{error}; " if str(error) else ""
-                raise KeyboardInterrupt(f"{said}{path} goes on with --resume") from error
+                raise _interrupted(path, error) from error
             raise
         shutil.rmtree(folder, ignore_errors=True)
         if replacing:
@@ -84,6 +83,24 @@ def run_folder(
                 parent.rmdir()
         raise
     shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextmanager
+def resumed_run(
+    path: str | Path, config: Mapping[str, Any] | Any, free: Sequence[str] = ()
+) -> Iterator[Path]:
+    """The folder of `continue_run`; where the body is interrupted, what is told says how the run
+    goes on."""
+    folder = continue_run(path, config, free)
+    try:
+        yield folder
+    except KeyboardInterrupt as error:
+        raise _interrupted(path, error) from error
+
+
+def _interrupted(path: str | Path, error: KeyboardInterrupt) -> KeyboardInterrupt:
+    said = f"{error}; " if str(error) else ""
+    return KeyboardInterrupt(f"{said}{path} goes on with --resume")
 
 
 def check_target(
@@ -118,7 +135,7 @@ def check_folder(path: str | Path, overwrite: bool = False) -> None:
     _check_place(folder)
 
 
-def _holds_run(folder: Path, overwrite: bool) -> bool:
+def _holds_run(folder: Path, overwrite: bool, resumable: str | None = None) -> bool:
     """Whether an earlier run is to be replaced; `RunError` where nothing may be put there."""
     if folder.exists() and not folder.is_dir():
         raise RunError(folder, "is a file", "name a folder for the results")
@@ -126,7 +143,10 @@ def _holds_run(folder: Path, overwrite: bool) -> bool:
         _check_place(folder)
         return False
     if not overwrite:
-        raise RunError(folder, "is not empty", "name a new folder or pass --overwrite")
+        stopped = bool(resumable) and (folder / str(resumable)).exists()
+        stopped = stopped and not (folder / RESULTS_FILE).exists()
+        remedy = "go on with --resume, name" if stopped else "name"
+        raise RunError(folder, "is not empty", f"{remedy} a new folder or pass --overwrite")
     if not (folder / VERSIONS_FILE).is_file():
         raise RunError(
             folder, f"is not a run (no {VERSIONS_FILE}), not overwritten", "name a new folder"
@@ -191,17 +211,24 @@ def continue_run(
     folder = Path(path)
     if not (folder / CONFIG_FILE).is_file():
         raise RunError(folder, "holds no run to go on with", "leave out --resume")
+    if to_plain(config).get("overwrite"):
+        raise RunError(folder, "is to be resumed and overwritten", "leave out one of the two")
     before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
     now = to_plain(config)
     differing = [key for key in now if key not in free and now[key] != before.get(key)]
     if differing:
         raise RunError(
-            folder, f"holds a run with another {', '.join(differing)}", "name a new folder"
+            folder, f"holds a run whose {_listed(differing)} not the same", "name a new folder"
         )
     if any(now[key] != before.get(key) for key in now if key not in ("resume", "overwrite")):
         text = yaml.safe_dump({**now, "resume": False, "overwrite": False}, sort_keys=False)
         write_text(folder / CONFIG_FILE, text)
     return folder
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names with the verb that fits them."""
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def write_results(

@@ -6,7 +6,7 @@ import base64
 import math
 import shutil
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from tpcd.figures.diagnosis import evidence_bars, gap_bars, residual_map, theta_
 from tpcd.figures.sinks import save_figure
 from tpcd.files import read_json, write_json
 from tpcd.predict import ContactPredictor
-from tpcd.results import RESULTS_FILE, continue_run, run_folder
+from tpcd.results import RESULTS_FILE, resumed_run, run_folder
 from tpcd.versions import versions
 
 EXIT_CODES = {
@@ -51,7 +51,7 @@ def open_diagnosis(
         return run_folder(folder, "scripts/diagnose.py", config, overwrite, resumable=FITS_FOLDER)
     if (folder / RESULTS_FILE).is_file():
         raise RunError(folder, "has its verdict", "leave out --resume")
-    return nullcontext(continue_run(folder, config, ("out", "resume", "overwrite")))
+    return resumed_run(folder, config, ("out", "resume"))
 
 
 def fits_of(folder: Path, code: Sequence[Path]) -> Memory:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.belief import Belief
@@ -20,6 +21,8 @@ from tpcd.figures.scene import scene as scene_figure
 from tpcd.figures.sinks import save_figure
 
 OUTLINES_DRAWN = 200
+DIRECTIONS = 72
+"""In which outlines are compared."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +42,12 @@ def draw_estimation(
     truth: KnownTruth | None,
     prefix: str = "",
     heading: str = "figures",
+    closed: bool = False,
 ) -> None:
     """Figures of what was learnt: parameters step by step, the outline, and the scene.
 
-    `prefix` leads their names, `heading` is where TensorBoard shows them.
+    `prefix` leads their names, `heading` is where TensorBoard shows them; `closed` says that the
+    last row of the history is of the closing draws.
     """
     z = belief.prior.shape.latent_dim
     names = belief.prior.names[z:]
@@ -62,6 +67,7 @@ def draw_estimation(
         names=labels,
         units=units,
         truth=known,
+        closed=closed,
     )
     save_figure(figure, folder, f"{prefix}estimation", writer, last, heading)
     chosen = torch.linspace(0, len(belief.weights) - 1, OUTLINES_DRAWN).long().unique()
@@ -76,17 +82,28 @@ def draw_estimation(
     for name in ("floor_height", "wall_position"):
         i = names.index(name)
         surfaces[name] = tuple(float(columns[key][-1, i]) for key in ("mean", "low", "high"))
-    central = points[int(belief.weights[chosen].argmax())].double().numpy()
     figure = scene_figure(
         episode.poses.numpy(),
-        central if vertices is None else vertices,
+        central_outline(points, belief.weights[chosen]).numpy() if vertices is None else vertices,
         surfaces["floor_height"],
         surfaces["wall_position"],
         true_floor=None if truth is None else truth.scene["floor_height"],
         true_wall=None if truth is None else truth.scene["wall_position"],
         commands=episode.commands.numpy(),
+        outline="a central draw" if vertices is None else "",
     )
     save_figure(figure, folder, f"{prefix}scene", writer, last, heading)
+
+
+def central_outline(
+    points: Float[Tensor, "m p 2"], weights: Float[Tensor, " m"]
+) -> Float[Tensor, "p 2"]:
+    """The outline nearest to all others by weight (their medoid), by how far each reaches in all
+    directions."""
+    angles = torch.linspace(0, 2 * math.pi, DIRECTIONS + 1, dtype=torch.float64)[:-1]
+    directions = torch.stack((angles.cos(), angles.sin()))
+    reach = (points.double() @ directions).amax(1)
+    return points[int((torch.cdist(reach, reach, p=1.0) @ weights).argmin())].double()
 
 
 def _shown(belief: Belief) -> tuple[list[str], list[str], Any]:

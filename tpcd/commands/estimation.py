@@ -131,7 +131,15 @@ class EstimationRun:
         if warning is not None:
             self.bar.write(warning, file=sys.stderr)
         rows = [*self.history[:-1], last]
-        draw_estimation(self.belief, rows, episode, self.folder / "figures", self.writer, truth)
+        draw_estimation(
+            self.belief,
+            rows,
+            episode,
+            self.folder / "figures",
+            self.writer,
+            truth,
+            closed="closed" in self.history[-1],
+        )
         return self.belief
 
     def _close(self, episode: Episode) -> dict[str, Any] | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -25,7 +24,7 @@ from tpcd.exploration import Estimator, explore
 from tpcd.policies import Limits
 from tpcd.policies.active import Task
 from tpcd.policies.protocol import Policy
-from tpcd.results import RESULTS_FILE, continue_run, format_table, run_folder, write_results
+from tpcd.results import RESULTS_FILE, format_table, resumed_run, run_folder, write_results
 from tpcd.robot.protocol import Robot
 from tpcd.shape.checkpoint import load_prior
 
@@ -70,7 +69,7 @@ def explore_in_folder(
     )
     if options.resume:
         check_kept_model(model, options.out)
-        opened = nullcontext(continue_run(options.out, options, may_change))
+        opened = resumed_run(options.out, options, may_change)
     else:
         opened = run_folder(options.out, command, options, options.overwrite, resumable=resumable)
     with opened as folder:

@@ -44,6 +44,15 @@ def check_start_of(episode: Episode, belief: Belief) -> None:
     )
 
 
+def check_start_after(episode: Episode, belief: Belief) -> None:
+    """The same for the episode that the belief was learnt from: then its rows contradict the first
+    one."""
+    remedy = "the estimate is not to be trusted: measure the start pose again, free of contact"
+    _refuse_inside(
+        episode, belief.prior.shape, belief.parameters, "particles of the belief", remedy
+    )
+
+
 def _refuse_inside(
     episode: Episode, shape: Shape, parameters: Parameters, what: str, remedy: str
 ) -> None:

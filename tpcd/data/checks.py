@@ -25,6 +25,8 @@ POSE_COLUMNS = ("x", "z", "phi")
 WRENCH_COLUMNS = ("F_x", "F_z", "tau")
 LARGEST_JUMP = 0.5
 """Commands, or poses, of neighbouring rows further apart than this [m] are taken for an error."""
+LARGEST_TURN = 2.0
+"""The same of their angles [rad]."""
 LARGEST_WRENCH = 1e4
 """Forces and torques beyond this [N, N·m] are taken for millinewtons or a fault."""
 NOISE_FACTOR = 6.0
@@ -92,16 +94,25 @@ def check_rows(
 
 
 def _check_jumps(path: Path, what: str, names: tuple[str, ...], values: np.ndarray) -> None:
-    jumps = np.linalg.norm(np.diff(values[:, :2], axis=0), axis=1)
-    if not len(jumps) or jumps.max() <= LARGEST_JUMP:
-        return
-    row = int(np.argmax(jumps > LARGEST_JUMP)) + 1
-    raise EpisodeError(
-        path,
-        f"{row_name(row, path)}, columns {names[0]}, {names[1]}: the {what} jumps by"
-        f" {jumps[row - 1]:.3g} m, expected at most {LARGEST_JUMP} m",
-        f"check the frame of the {what}s, or split the episode there",
-    )
+    steps = np.diff(values, axis=0)
+    turns = np.abs(np.remainder(steps[:, 2] + math.pi, 2 * math.pi) - math.pi)
+    for columns, verb, sizes, largest, unit in (
+        (f"columns {names[0]}, {names[1]}", "jumps", _lengths(steps), LARGEST_JUMP, "m"),
+        (f"column {names[2]}", "turns", turns, LARGEST_TURN, "rad"),
+    ):
+        if not len(sizes) or sizes.max() <= largest:
+            continue
+        row = int(np.argmax(sizes > largest)) + 1
+        raise EpisodeError(
+            path,
+            f"{row_name(row, path)}, {columns}: the {what} {verb} by {sizes[row - 1]:.3g} {unit},"
+            f" expected at most {largest:g} {unit}",
+            f"check the frame of the {what}s, or split the episode there",
+        )
+
+
+def _lengths(steps: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(steps[:, :2], axis=1)
 
 
 def _check_start(
@@ -140,7 +151,7 @@ def _check_column(path: Path, name: str, column: np.ndarray, limit: tuple[float,
         raise EpisodeError(
             path,
             f"{row_name(row, path)}, column {name}: found {column[row]}, expected a finite number",
-            "drop the step from the recording or measure it again",
+            "measure the step again, or split the episode there",
         )
     largest, unit, likely = limit
     if len(column) and np.abs(column).max() > largest:

@@ -27,11 +27,13 @@ def estimation_progress(
     names: Sequence[str],
     units: Sequence[str],
     truth: Float[Array, " d"] | None = None,
+    closed: bool = False,
 ) -> Figure:
     """Draw mean and band [low, high] of d parameters over n steps, in SI units.
 
     `names` and `units` are those of `tpcd.parameters` for the chosen columns; where `truth` is
-    NaN it is not drawn. Raises `ValueError` when their number is not d.
+    NaN it is not drawn. `closed` marks the last step as that of the closing draws. Raises
+    `ValueError` when the number of names or units is not d.
     """
     steps, mean, low, high = (np.asarray(value) for value in (steps, mean, low, high))
     if not len(names) == len(units) == mean.shape[1]:
@@ -49,6 +51,10 @@ def estimation_progress(
         )
         (line,) = panel.plot(steps, factor * mean[:, i], color=BELIEF, linewidth=1.8)
         handles |= {"mean of the belief": line, "90 % interval": band}
+        if closed:
+            last = (steps[-1:], factor * mean[-1:, i])
+            (mark,) = panel.plot(*last, "o", color=BELIEF, markersize=5, clip_on=False)
+            handles["from the closing draws"] = mark
         value = math.nan if truth is None else factor * float(np.asarray(truth)[i])
         if math.isfinite(value):
             handles["truth"] = panel.axhline(value, color=TRUTH, linestyle="--", linewidth=1.2)

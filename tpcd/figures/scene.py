@@ -30,11 +30,13 @@ def scene(
     true_floor: float | None = None,
     true_wall: float | None = None,
     commands: Float[Array, "n 3"] | None = None,
+    outline: str = "",
 ) -> Figure:
     """Draw n poses [m, m, rad] of an outline given in the end-effector frame [m].
 
     `floor` and `wall` are (mean, low, high) of the floor's z and the wall's x [m] in the
-    world; `true_floor` and `true_wall` add dashed lines, `commands` the commanded path.
+    world; `true_floor` and `true_wall` add dashed lines, `commands` the commanded path. What is to
+    be said of the outline goes to the legend.
     """
     poses, points = np.asarray(poses, dtype=float), 1e3 * np.asarray(points_ee, dtype=float)
     figure, (panel,) = panels(1, 1, 6.4, 4.8)
@@ -42,12 +44,13 @@ def scene(
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_OUTLINES)).astype(int))
     colours = colormaps["Blues"](np.linspace(0.25, 0.95, len(chosen)))
     outlines = [_placed(points, poses[k]) for k in chosen]
-    for outline, colour in zip(outlines, colours, strict=True):
-        panel.add_patch(Polygon(outline, closed=True, fill=False, edgecolor=colour, linewidth=1.1))
+    for placed, colour in zip(outlines, colours, strict=True):
+        panel.add_patch(Polygon(placed, closed=True, fill=False, edgecolor=colour, linewidth=1.1))
     path = 1e3 * poses[:, :2]
     panel.plot(*path.T, color="0.25", linewidth=1.0, marker="o", markersize=2.5)
+    drawn_as = f"object ({outline})" if outline else "object"
     entries: dict[str, LegendKey] = {
-        f"object at step {chosen[0]}": Line2D([], [], color=colours[0]),
+        f"{drawn_as} at step {chosen[0]}": Line2D([], [], color=colours[0]),
         f"object at step {chosen[-1]}": Line2D([], [], color=colours[-1]),
         "end effector": Line2D([], [], color="0.25", marker="o", markersize=3),
     }

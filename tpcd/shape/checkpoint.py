@@ -44,6 +44,7 @@ _MISFIT = {
 }
 """Keys of the card and the fields of `Misfit` that they hold."""
 _REMEDY = "export it again with `python -m training.train`, or use a shipped prior"
+_NEWER = "use the version of tpcd that it was made with, or a shipped prior"
 
 
 def load_prior(path_or_name: str | Path) -> DeepSDFShape:
@@ -148,8 +149,11 @@ def _read_card(path: Path) -> dict[str, Any]:
         raise CheckpointError(path, f"is not a card of format '{FORMAT}'", _REMEDY)
     version = card.get("format_version")
     if version != FORMAT_VERSION:
+        newer = isinstance(version, int) and version > FORMAT_VERSION
         raise CheckpointError(
-            path, f"has format version {version}, this program reads {FORMAT_VERSION}", _REMEDY
+            path,
+            f"has format version {version}, this program reads {FORMAT_VERSION}",
+            _NEWER if newer else _REMEDY,
         )
     return card
 

@@ -12,7 +12,8 @@ from tpcd.shape.ycb import load_ycb, ycb_folder
 
 
 def find_outline(name: str, unit: str | None = None) -> Outline:
-    """The outline of a file (in `unit`) or of a name; `ValueError` if there is none."""
+    """The outline of a file (in `unit`) or of a name; `ValueError` if there is none, or a name has
+    a unit."""
     if Path(name).suffix:
         outlines = load_outlines(name, unit=unit)
         if len(outlines) != 1:
@@ -21,6 +22,8 @@ def find_outline(name: str, unit: str | None = None) -> Outline:
                 " expected one; save the one you mean to its own file"
             )
         return next(iter(outlines.values()))
+    if unit is not None:
+        raise ValueError(f"unit is {unit!r}, expected none for {name!r}, which is no file")
     outlines = builtin_outlines()
     if name not in outlines and ycb_folder() is not None:
         outlines = {**outlines, **load_ycb("all")}

@@ -147,7 +147,8 @@ def cut_mesh(
     largest = max(loops, key=lambda loop: loop.area)
     pieces = [p for p in loops if p is not largest and not largest.contains(p)]
     extra = sum(p.area for p in pieces) / largest.area
-    notes = f"the cut has {len(pieces)} further pieces, {extra:.0%} of the area, left out"
+    further = "1 further piece" if len(pieces) == 1 else f"{len(pieces)} further pieces"
+    notes = f"the cut has {further}, {extra:.0%} of the largest one's area, left out"
     if close_recesses:
         largest = _recesses_closed(largest)
     return make_outline(

@@ -77,7 +77,9 @@ def load_svg(
         if name in outlines:
             name = f"{name}-{index + 1}"
         points = _outer_loop(path, name, [flatten(loop, tolerance) for loop in subpaths])
-        outlines[name] = make_outline(name, points, path=path, source=path.name)
+        holes = len(subpaths) - 1
+        notes = f"loops inside its outline, holes perhaps: {holes}, filled" if holes else ""
+        outlines[name] = make_outline(name, points, path=path, source=path.name, notes=notes)
     return outlines
 
 

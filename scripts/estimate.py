@@ -56,6 +56,7 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.commands.plausibility import check_start_after, check_start_pose
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
+    from tpcd.data.checks import check_units
     from tpcd.errors import RunError
     from tpcd.exploration import Estimator
     from tpcd.results import (
@@ -72,6 +73,7 @@ def estimate_episode(config: Estimate) -> None:
     episode = read_episode(config.episode)
     model = model_of(config.model)
     shape = load_prior(config.prior)
+    check_units(episode)
     check_start_pose(episode, shape)
     for warning in check_episode(episode):
         print(f"warning: {warning}", file=sys.stderr)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tpcd.data import Episode, check_episode, read_episode, write_episode
-from tpcd.data.checks import LARGEST_WRENCH
+from tpcd.data.checks import LARGEST_WRENCH, check_units
 from tpcd.data.files import write_together
 from tpcd.errors import EpisodeError
 
@@ -327,8 +327,15 @@ def test_an_inverted_wrench_is_a_warning_and_a_right_one_is_none(tmp_path):
         sensor_std=torch.tensor([1e-4, 1e-4, 5e-4, 0.05, 0.05, 0.05], dtype=torch.float64),
     )
     assert check_episode(episode) == []
+    check_units(episode)
     (warning,) = check_episode(replace(episode, wrenches=-episode.wrenches))
     assert "F_z looks inverted" in warning
+    with pytest.raises(EpisodeError, match="F_z looks inverted.*change the sign of the column F_z"):
+        check_units(replace(episode, wrenches=-episode.wrenches))
+    with pytest.raises(
+        EpisodeError, match=r"F_z is 0\.00\d+ times .*, expected about 1; give forces"
+    ):
+        check_units(replace(episode, stiffness=stiffness * 1000))
     (warning,) = check_episode(replace(episode, stiffness=stiffness * 1000))
     assert "check the stiffness" in warning
     degrees = torch.tensor([1, 1, 180 / torch.pi], dtype=torch.float64)
@@ -336,6 +343,9 @@ def test_an_inverted_wrench_is_a_warning_and_a_right_one_is_none(tmp_path):
     turned[1:, 2] = 0.02
     told = replace(episode, poses=turned, wrenches=stiffness * (turned - commands) + noise)
     assert check_episode(told) == []
+    check_units(told)
+    with pytest.raises(EpisodeError, match="angles are in degrees; multiply u_phi and phi"):
+        check_units(replace(told, poses=turned * degrees))
     (warning,) = check_episode(replace(told, poses=turned * degrees))
     assert "as where angles are in degrees" in warning and "pi / 180" in warning
     free = replace(episode, poses=commands, wrenches=noise)

@@ -1,8 +1,8 @@
 """What the rows of an episode must obey, and what merely looks odd about them.
 
-`check_rows` refuses rows that cannot be data in the agreed units; `check_episode` returns
-sentences on what is possible but suspicious, such as a wrench of the wrong sign. Rows are
-counted from 0, the free start pose.
+`check_rows` refuses rows that cannot be data in the agreed units, and `check_units` wrenches that
+are not those of the stiffness; `check_episode` returns sentences on what is possible but
+suspicious. Rows are counted from 0, the free start pose.
 """
 
 from __future__ import annotations
@@ -36,8 +36,12 @@ ROUNDING = 1e-6
 NO_CONTACT = "no step shows contact beyond the noise: it tells only where nothing is"
 INVERTED = -0.3
 """A wrench that is less than this many times K (pose - command) has the opposite sign."""
+ANOTHER_ORDER = 5.0
+"""Forces that are larger or smaller than K (pose - command) by this factor are in other units."""
 LEAST_FELT = 2
 """So many rows beyond the noise are no bad reading any more."""
+LEAST_ROWS = 3
+"""Rows beyond the noise that tell in which units an episode is."""
 FREE_WRENCH = 1e-3
 """The start wrench may differ from 0 by this much [N, N·m] on top of noise: printed digits."""
 
@@ -184,7 +188,7 @@ def check_episode(episode: Episode) -> list[str]:
             continue
         if slope < INVERTED:
             warnings.append(inverted_sentence(name, slope))
-        elif name == "tau" and 0.5 < math.degrees(slope) < 2.0:
+        elif name == "tau" and _as_in_degrees(slope):
             warnings.append(
                 f"tau is {slope:.2g} times K (phi - u_phi), as where angles are in degrees;"
                 " expected rad: multiply u_phi and phi by pi / 180"
@@ -200,6 +204,40 @@ def check_episode(episode: Episode) -> list[str]:
     if silent:
         warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")
     return warnings
+
+
+def check_units(episode: Episode) -> None:
+    """Refuse an episode whose wrench is plainly not K (pose - command) in SI units.
+
+    By the median over the rows in which that is beyond the noise, three at least: a force of the
+    opposite sign or of another order of magnitude, or a torque as where angles are in degrees. A
+    torque may be off otherwise by the point that it is about. Raises `EpisodeError`.
+    """
+    significant, _ = _beyond_noise(episode)
+    wrenches, expected = episode.wrenches.numpy(), _expected_wrenches(episode)
+    for axis, name in enumerate(WRENCH_COLUMNS):
+        rows = significant[:, axis]
+        if rows.sum() < LEAST_ROWS:
+            continue
+        ratio = float(np.median(wrenches[rows, axis] / expected[rows, axis]))
+        if name == "tau":
+            if not _as_in_degrees(ratio):
+                continue
+            told = f"tau is {ratio:.2g} times K (phi - u_phi), as where angles are in degrees"
+            remedy = "multiply u_phi and phi, and their noise, by pi / 180"
+        elif ratio < INVERTED:
+            told = inverted_sentence(name, ratio)
+            remedy = f"change the sign of the column {name}, or of its frame"
+        elif not 1 / ANOTHER_ORDER < ratio < ANOTHER_ORDER:
+            told = f"{name} is {ratio:.2g} times K (pose - command), expected about 1"
+            remedy = "give forces in N, poses and commands in m, and the stiffness in N/m"
+        else:
+            continue
+        raise EpisodeError(episode.path or "episode", told, remedy)
+
+
+def _as_in_degrees(ratio: float) -> bool:
+    return 0.5 < math.degrees(ratio) < 2.0
 
 
 def wrench_slopes(episode: Episode) -> dict[str, float | None]:

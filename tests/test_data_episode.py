@@ -152,7 +152,7 @@ BAD_TABLES = {
     "jump": (edit(2, "u_x", "0.8"), ["row 2 (line 4)", "u_x", "jumps by 0.8 m", "0.5 m"]),
     "millimetres": (edit(1, "x", "12.5"), ["row 1", "column x", "12.5", "millimetres"]),
     "degrees": (edit(1, "u_phi", "-45"), ["row 1", "column u_phi", "-45", "degrees"]),
-    "turn": (edit(2, "u_phi", "2.6"), ["row 2 (line 4)", "u_phi", "turns by", "2 rad"]),
+    "turn": (edit(2, "u_phi", "2.6"), ["row 2 (line 4)", "turns by", "2 rad; give u_phi in rad"]),
     "pose jumps": (edit(2, "x", "0.8"), ["row 2 (line 4)", "x, z", "the pose jumps by 0.8 m"]),
     "millinewtons": (edit(2, "F_z", "12000"), ["row 2", "F_z", "12000", "millinewtons"]),
     "start in contact": (edit(0, "F_z", "2.5"), ["row 0 (line 2), column F_z", "2.5", "zero"]),

@@ -100,9 +100,11 @@ def check_rows(
 def _check_jumps(path: Path, what: str, names: tuple[str, ...], values: np.ndarray) -> None:
     steps = np.diff(values, axis=0)
     turns = np.abs(np.remainder(steps[:, 2] + math.pi, 2 * math.pi) - math.pi)
-    for columns, verb, sizes, largest, unit in (
-        (f"columns {names[0]}, {names[1]}", "jumps", _lengths(steps), LARGEST_JUMP, "m"),
-        (f"column {names[2]}", "turns", turns, LARGEST_TURN, "rad"),
+    position, angle = f"columns {names[0]}, {names[1]}", f"column {names[2]}"
+    frame, unit_of_angle = f"check the frame of the {what}s", f"give {names[2]} in rad"
+    for columns, verb, sizes, largest, unit, remedy in (
+        (position, "jumps", _lengths(steps), LARGEST_JUMP, "m", frame),
+        (angle, "turns", turns, LARGEST_TURN, "rad", unit_of_angle),
     ):
         if not len(sizes) or sizes.max() <= largest:
             continue
@@ -111,7 +113,7 @@ def _check_jumps(path: Path, what: str, names: tuple[str, ...], values: np.ndarr
             path,
             f"{row_name(row, path)}, {columns}: the {what} {verb} by {sizes[row - 1]:.3g} {unit},"
             f" expected at most {largest:g} {unit}",
-            f"check the frame of the {what}s, or split the episode there",
+            f"{remedy}, or split the episode there",
         )
 
 

@@ -39,6 +39,8 @@ class Estimate:
         check_numbers(self, least={"particles": 16}, above=above, most=most)
         if self.model is not None and self.estimator == "paper":
             raise ValueError("the estimator paper has a model of its own; leave --model out")
+        if self.resume and self.overwrite:
+            raise ValueError("give --resume or --overwrite, not both")
 
 
 def estimate_episode(config: Estimate) -> None:
@@ -53,11 +55,11 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
-    from tpcd.commands.plausibility import check_start_after, check_start_pose
+    from tpcd.commands.plausibility import check_start_pose, contradicted_start
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
     from tpcd.data.checks import check_units
-    from tpcd.errors import RunError
+    from tpcd.errors import EpisodeError, RunError
     from tpcd.exploration import Estimator
     from tpcd.results import (
         RESULTS_FILE,
@@ -78,9 +80,9 @@ def estimate_episode(config: Estimate) -> None:
     for warning in check_episode(episode):
         print(f"warning: {warning}", file=sys.stderr)
     if config.resume:
+        check_kept_model(model, config.out)
         if (config.out / RESULTS_FILE).is_file():
             raise RunError(config.out, "is finished", "leave out --resume and name a new folder")
-        check_kept_model(model, config.out)
         # The state knows its data and the run its model, so files may have been moved.
         free = ("episode", "model", "out", "resume")
         opened = resumed_run(config.out, config, free)
@@ -107,8 +109,12 @@ def estimate_episode(config: Estimate) -> None:
         print(text)
         with SummaryWriter(folder / "tensorboard") as writer:
             writer.add_text("table", f"```\n{text}\n```")
-        write_results(folder, table, seeds=[config.seed])
-    check_start_after(episode, belief)
+        # The paper's filter does not know that the start is free.
+        paper = config.estimator == "paper"
+        contradicted = "" if paper else contradicted_start(episode, belief)
+        write_results(folder, table, seeds=[config.seed], contradicted=contradicted)
+    if contradicted:
+        raise EpisodeError(config.episode, contradicted, f"what was found is in {config.out}")
     print(
         f"\nresults in {config.out}; next: python scripts/predict.py {quote(str(config.out))}"
         " EPISODE --out FILE.csv"

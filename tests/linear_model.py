@@ -71,7 +71,8 @@ class LinearTarget:
         return -0.5 * (x**2).sum(-1) - 0.5 * DIMENSION * math.log(2 * math.pi)
 
     def log_likelihood(self, x: Tensor, least: Tensor | None) -> Tensor:
-        return self.likelihood(x)
+        value = self.likelihood(x)
+        return value if least is None else torch.where(value < least, -torch.inf, value)
 
     def curvature(self, x: Tensor) -> tuple[Tensor, Tensor]:
         rows, data = self.model.rows[: self.count], self.model.data[: self.count]

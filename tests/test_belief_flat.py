@@ -136,6 +136,19 @@ def test_what_is_rough_shapes_the_draws_and_does_not_weigh_them(rough: bool) -> 
     assert (pool.effective_sample_size < 0.8 * plain_worth(model)) == rough
 
 
+def test_what_is_rough_and_far_too_high_rules_no_draw_out() -> None:
+    """As high as that in a place far from the posterior, which many trial draws then find."""
+    model, far = LinearModel(5, seed=4), torch.tensor([2.0, -2.0, 2.0], dtype=torch.float64)
+    target = model.target(5)
+
+    def too_high(x: Tensor) -> Tensor:
+        return torch.where((x - far).norm(dim=-1) < 1.0, 200.0, target.likelihood(x))
+
+    generator = torch.Generator().manual_seed(3)
+    adapted = adapt(start_cloud(start()), replace(target, roughly=too_high), 5, SETTINGS, generator)
+    known_moments(adapted.pool(target, 8000, generator), model, 5)
+
+
 def plain_worth(model: LinearModel) -> float:
     generator = torch.Generator().manual_seed(3)
     target = model.target(5)
@@ -145,9 +158,9 @@ def plain_worth(model: LinearModel) -> float:
 
 def test_a_long_history_has_fewer_draws() -> None:
     settings = SamplerSettings(draws=1000, flat_draws=150, full_draws=10)
-    found = [(each.draws, each.flat_draws) for each in map(settings.after, (1, 10, 16, 20, 500))]
+    found = [(each.draws, each.flat_draws) for each in map(settings.at, (1, 10, 16, 20, 500))]
     assert found == [(1000, 150), (1000, 150), (625, 100), (500, 100), (500, 100)]
-    assert replace(settings.after(16), draws=1000, flat_draws=150) == settings
+    assert replace(settings.at(16), draws=1000, flat_draws=150) == settings
 
 
 def test_rounds_end_once_their_draws_are_worth_enough() -> None:

@@ -29,6 +29,7 @@ PRIOR, STEPS = "ycb21-z2", 4
 SETTINGS = EstimatorSettings(
     sampler=SamplerSettings(particles=64, draws=600),
     closing=SamplerSettings(
+        rough=False,
         draws=3000,
         fresh_modes=60,
         flat_rounds=4,

@@ -138,6 +138,7 @@ def test_an_estimate_interrupted_after_a_step_goes_on(world, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr("tpcd.exploration.estimate", interrupted)
         assert call("estimate", *estimate_arguments(world, out)) == 130
+        assert call("estimate", *estimate_arguments(world, out), "--overwrite") == 130
     assert "run goes on with --resume" in capsys.readouterr().err
     again, resumed = estimate_arguments(world, out), (*estimate_arguments(world, out), "--resume")
     line = refused(capsys, world, "estimate", *again)
@@ -147,7 +148,7 @@ def test_an_estimate_interrupted_after_a_step_goes_on(world, tmp_path, monkeypat
         assert call("estimate", *resumed) == 130
     assert "run goes on with --resume" in capsys.readouterr().err
     line = refused(capsys, world, "estimate", *resumed, "--overwrite")
-    assert "run: is to be resumed and overwritten; leave out one of the two" in line
+    assert "give --resume or --overwrite, not both" in line
     assert call("estimate", *resumed) == 0
     results = [json.loads((run / "results.json").read_text()) for run in (whole, out)]
     assert results[0]["table"] == results[1]["table"]
@@ -161,8 +162,13 @@ def test_a_start_pose_that_its_own_rows_contradict_is_told(world, tmp_path, caps
     path = changed_episode(world, tmp_path, 0, {"z": z, "u_z": z})
     assert call("estimate", str(path), *estimate_arguments(world, tmp_path / "run")[1:]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    assert "changed.csv: row 0 (line 2)" in line and "mm inside the floor for all" in line
-    assert "not to be trusted" in line and (tmp_path / "run" / "results.json").is_file()
+    assert "changed.csv: row 0 (line 2)" in line and "mm inside the floor that the rows" in line
+    assert "not to be trusted" in line and "what was found is in" in line
+    told = json.loads((tmp_path / "run" / "results.json").read_text())["contradicted"]
+    assert told and told in line
+    arguments = (str(tmp_path / "run"), str(world / "test.csv"), "--out", str(tmp_path / "p.csv"))
+    assert call("predict", *arguments) == 0
+    assert told in capsys.readouterr().err
 
 
 PREDICT = {
@@ -264,7 +270,7 @@ def test_what_is_left_out_of_an_outline_is_told(tmp_path, capsys) -> None:
     words = ("--outline", str(tmp_path / "ring.svg"), "--truth", "quasistatic", "--steps", "1")
     assert call("simulate", *words, "--out", str(tmp_path / "data")) == 0
     told = capsys.readouterr()
-    assert "ring.svg: loops inside its outline, holes perhaps: 1, filled" in told.err
+    assert "ring.svg: 1 loop inside the outer one, taken for filled" in told.err
     assert told.out.startswith("ring: scale")
 
 

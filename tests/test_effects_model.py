@@ -247,11 +247,12 @@ def test_commands_take_a_model_and_go_on_with_no_other(
     capsys.readouterr()
     model.write_text("effects: [{name: force_bias}]\n")
     assert call("estimate", *words, "--model", str(model), "--resume") == 2
-    assert "another model" in capsys.readouterr().err
+    assert "whose model is not the same" in capsys.readouterr().err
     assert call("estimate", *words, "--resume") == 2
-    assert "another model" in capsys.readouterr().err
+    assert "whose model is not the same" in capsys.readouterr().err
     other = tmp_path / "moved.yaml"
     other.write_text("effects: [{name: force_bias}, {name: floor_tilt}]\n")
+    (tmp_path / "run" / "results.json").unlink()
     assert call("estimate", *words, "--model", str(other), "--resume") == 0
     assert call("estimate", *words, "--model", str(model), "--estimator", "paper") == 2
     assert "leave --model out" in capsys.readouterr().err

@@ -22,6 +22,7 @@ from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
 SAMPLER = SamplerSettings(
+    rough=False,
     particles=400,
     draws=6000,
     draws_per_place=9,

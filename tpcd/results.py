@@ -192,7 +192,7 @@ def _started(folder: Path, command: str, config: Mapping[str, Any] | Any) -> Pat
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(folder, f"cannot be made ({error.strerror})", ELSEWHERE) from error
-    body = yaml.safe_dump(to_plain(config), sort_keys=False, allow_unicode=True)
+    body = yaml.safe_dump(_kept(config), sort_keys=False, allow_unicode=True)
     write_text(folder / CONFIG_FILE, f"# {command}\n{body}")
     write_json(folder / VERSIONS_FILE, {"command": command, **versions()})
     return folder
@@ -204,26 +204,30 @@ def continue_run(
     """Return the folder of a run that was stopped, to go on in it.
 
     Raises `RunError` when the folder holds no run, or one of another configuration; entries
-    named in `free` may differ, and the run's `config.yaml` takes their new values.
+    named in `free` may differ, `resume` and `overwrite` always, and the run's `config.yaml` takes
+    their new values.
     """
     import yaml
 
     folder = Path(path)
     if not (folder / CONFIG_FILE).is_file():
         raise RunError(folder, "holds no run to go on with", "leave out --resume")
-    if to_plain(config).get("overwrite"):
-        raise RunError(folder, "is to be resumed and overwritten", "leave out one of the two")
     before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
-    now = to_plain(config)
+    before, now = _kept(before), _kept(config)
     differing = [key for key in now if key not in free and now[key] != before.get(key)]
     if differing:
         raise RunError(
             folder, f"holds a run whose {_listed(differing)} not the same", "name a new folder"
         )
-    if any(now[key] != before.get(key) for key in now if key not in ("resume", "overwrite")):
-        text = yaml.safe_dump({**now, "resume": False, "overwrite": False}, sort_keys=False)
-        write_text(folder / CONFIG_FILE, text)
+    if any(now[key] != before.get(key) for key in now):
+        write_text(folder / CONFIG_FILE, yaml.safe_dump(now, sort_keys=False))
     return folder
+
+
+def _kept(config: Mapping[str, Any] | Any) -> dict[str, Any]:
+    """What a run keeps of a configuration: how it was begun or gone on with does not matter."""
+    plain = to_plain(config)
+    return {key: False if key in ("resume", "overwrite") else plain[key] for key in plain}
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -7,13 +7,13 @@ configuration) and, at the end, the released prior: safetensors and a JSON card.
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from tpcd.cli import run
 from tpcd.errors import RunError
-from tpcd.results import check_folder, continue_run, run_folder
+from tpcd.files import read_json
+from tpcd.results import check_folder, resumed_run, run_folder, write_results
 from training.config import TrainingConfig
 
 
@@ -38,6 +38,7 @@ class Training(TrainingConfig):
 def train_prior(config: Training) -> None:
     """Train a shape prior, measure it and write it with its card."""
     # torch and Lightning take seconds to import; --help should not wait for them.
+    from tpcd.shape.checkpoint import CARD
     from training.run import CHECKPOINT, train
 
     settings = {field.name: getattr(config, field.name) for field in fields(TrainingConfig)}
@@ -50,13 +51,16 @@ def train_prior(config: Training) -> None:
         if not (out / CHECKPOINT).is_file():
             raise RunError(out, f"holds no {CHECKPOINT} to resume from", "leave out --resume")
         may_change = [name for name in vars(config) if name not in ("data", "layout", "network")]
-        opened = nullcontext(continue_run(out, config, may_change))
+        opened = resumed_run(out, config, may_change)
     else:
         opened = run_folder(
             out, "python -m training.train", config, config.overwrite, resumable=CHECKPOINT
         )
     with opened:
         folder = train(TrainingConfig(**settings), out, export, config.resume)
+        errors = read_json(folder / CARD)["training_errors_mm"]
+        table = [{"error_mm": name, **values} for name, values in errors.items()]
+        write_results(out, table, seeds=[config.optim.seed])
     wall, cpu = time.perf_counter() - began, time.process_time() - began_cpu
     print(f"prior written to {folder} (measuring included: {wall:.0f} s, {cpu:.0f} CPU s)")
 

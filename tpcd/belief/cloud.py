@@ -90,8 +90,8 @@ class Counted:
     target: Target
     evaluations: int = 0
 
-    def rough(self) -> Target:
-        """Of the target, counted on its own from here on."""
+    def rough(self) -> Counted:
+        """Of the target, which counts on from here."""
         return Counted(self.target.rough(), self.evaluations)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:

@@ -52,7 +52,7 @@ def assimilate(
 
     Raises ValueError where no particle can explain the datum at all.
     """
-    settings = settings.after(datum)
+    settings = settings.at(datum)
     pool = draw_pool(cloud, target, datum, settings, generator)
     after = pool.cloud(settings.particles, generator)
     return after, pool.info(settings.rounds, len(after.weights))
@@ -79,11 +79,10 @@ def adapt(
     generator: torch.Generator,
 ) -> Adapted:
     """A proposal that starts at the cloud and the modes, and goes to where the weight is."""
-    target = Counted(target)
-    # The particles were weighed by the exact one before.
-    log_likelihood, contact = target.log_likelihood_and_contact(cloud.positions)
+    exact = Counted(target)
+    log_likelihood, contact = exact.log_likelihood_and_contact(cloud.positions)
     brought_on = known_weights(_brought_on(cloud, log_likelihood))
-    target = target.rough() if settings.rough else target
+    target = exact.rough() if settings.rough else exact
     begun = None
     if settings.flat_rounds:
         coordinates = target.coordinates(cloud.positions, brought_on, contact)
@@ -119,8 +118,14 @@ def adapt(
         flat = adapt_flat(target, flat, settings, generator)
         proposal = replace(proposal, flat=flat)
     # Not the very best: the weight of a draw in a place that the mixture hardly reaches is chance.
-    best = float(trial.log_weights.topk(min(TRUSTED, len(trial.positions))).values[-1])
-    return Adapted(proposal, best, peaks, shares, target.evaluations)
+    best = trial.log_weights.topk(min(TRUSTED, len(trial.positions)))
+    worth = best.values
+    if settings.rough:
+        # What is rough may be too high, and would rule out what is right.
+        known = exact.log_likelihood(trial.positions[best.indices], None)
+        worth = torch.minimum(worth, finite(worth + known - trial.log_likelihood[best.indices]))
+        target.evaluations += len(known)
+    return Adapted(proposal, float(worth.min()), peaks, shares, target.evaluations)
 
 
 @dataclass(frozen=True)
@@ -231,7 +236,8 @@ def _follow(
     settings: SamplerSettings,
     generator: torch.Generator,
 ) -> Climbers:
-    """Particles that explain the new datum best, a damped Newton step on."""
+    """Particles that explain the new datum best, a damped Newton step on; where the exact target
+    is higher than the one that is climbed they stay."""
     chosen = spread_choice(log_weights, settings.places, generator)
     places = cloud.positions[chosen]
     height = finite(target.log_prior(places) + log_likelihood[chosen])

@@ -51,8 +51,8 @@ class SamplerSettings:
     rough: bool = True
     """Whether all but the draws that count are of `Target.rough`."""
     full_draws: int = 10
-    """Datum up to which `draws` and `flat_draws` are as many as that. They fall as 1 / k with a
-    later datum k, to half, since each takes k transitions to weigh."""
+    """Datum up to which `draws` and `flat_draws` are as many as that. Where `assimilate` brings in
+    a later datum k they fall as 1 / k, to half or 100, since each takes k transitions to weigh."""
 
     def __post_init__(self) -> None:
         """Refuse budgets without meaning."""
@@ -80,7 +80,7 @@ class SamplerSettings:
             if not getattr(self, name) >= limit:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least {limit}")
 
-    def after(self, datum: int) -> SamplerSettings:
+    def at(self, datum: int) -> SamplerSettings:
         """The budget that datum 1, 2, ... has."""
         share = min(1.0, max(0.5, self.full_draws / datum))
         draws, flat_draws = (max(100, round(share * n)) for n in (self.draws, self.flat_draws))

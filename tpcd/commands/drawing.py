@@ -99,11 +99,12 @@ def central_outline(
     points: Float[Tensor, "m p 2"], weights: Float[Tensor, " m"]
 ) -> Float[Tensor, "p 2"]:
     """The outline nearest to all others by weight (their medoid), by how far each reaches in all
-    directions."""
+    directions; of those with a weight."""
     angles = torch.linspace(0, 2 * math.pi, DIRECTIONS + 1, dtype=torch.float64)[:-1]
     directions = torch.stack((angles.cos(), angles.sin()))
     reach = (points.double() @ directions).amax(1)
-    return points[int((torch.cdist(reach, reach, p=1.0) @ weights).argmin())].double()
+    distance = torch.cdist(reach, reach, p=1.0) @ weights
+    return points[int(torch.where(weights > 0, distance, torch.inf).argmin())].double()
 
 
 def _shown(belief: Belief) -> tuple[list[str], list[str], Any]:

@@ -30,7 +30,7 @@ def check_kept_model(model: Model, folder: Path) -> None:
     path = folder / MODEL_FILE
     before = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else _plain(Model())
     if before != _plain(model):
-        raise RunError(folder, "holds a run with another model", "name a new folder")
+        raise RunError(folder, "holds a run whose model is not the same", "name a new folder")
 
 
 def keep_model(model: Model, folder: Path, given: Path | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from tpcd.belief.belief import Belief
 from tpcd.belief.prior import make_prior
@@ -19,6 +20,10 @@ DRAWS = 1000
 """Draws from the prior; what one draw in 100 explains is missed 4 times in 100,000."""
 OUTLINE_ERROR = 5e-3
 """The start may be this deep inside [m]: real outlines differ from those of the prior."""
+OUTLINE_DEVIATIONS = 3.0
+"""So many standard deviations of the outline's error deeper once there is a belief,"""
+LARGEST_MISFIT = 0.02
+"""where that is less than this [m]: a larger one is made up for the start's sake."""
 TERRAINS = ("floor", "wall")
 
 
@@ -44,37 +49,63 @@ def check_start_of(episode: Episode, belief: Belief) -> None:
     )
 
 
-def check_start_after(episode: Episode, belief: Belief) -> None:
-    """The same for the episode that the belief was learnt from: then its rows contradict the first
-    one."""
-    remedy = "the estimate is not to be trusted: measure the start pose again, free of contact"
-    _refuse_inside(
-        episode, belief.prior.shape, belief.parameters, "particles of the belief", remedy
+def contradicted_start(episode: Episode, belief: Belief) -> str:
+    """A sentence where the start pose of the episode that a belief was learnt from is inside floor
+    or wall by what the rows after it tell, also with what is believed of the outline's error; else
+    empty.
+
+    Effects move terrains, and with them nothing is said.
+    """
+    if belief.prior.effects:
+        return ""
+    some = belief.weights > 0
+    parameters = belief.prior.parameters_of(belief.vectors[some])
+    sd = belief.misfit_sd[some]
+    explains = torch.where(sd < LARGEST_MISFIT, OUTLINE_DEVIATIONS * sd, 0.0)
+    found = _inside(episode, belief.prior.shape, parameters, OUTLINE_ERROR + explains)
+    if found is None:
+        return ""
+    depth, where = found
+    return (
+        f"{_start_of(episode)} is at least {depth:.0f} mm inside the {where} that the rows after it"
+        " tell of; the estimate is not to be trusted: measure the start again, free of contact"
     )
 
 
 def _refuse_inside(
     episode: Episode, shape: Shape, parameters: Parameters, what: str, remedy: str
 ) -> None:
+    found = _inside(episode, shape, parameters, OUTLINE_ERROR)
+    if found is None:
+        return
+    depth, where = found
+    raise EpisodeError(
+        episode.path or "episode",
+        f"{_start_of(episode)} is at least {depth:.0f} mm inside the {where} for all of"
+        f" {len(parameters.scale)} {what}, expected a pose free of contact",
+        remedy,
+    )
+
+
+def _start_of(episode: Episode) -> str:
+    x, z, angle = episode.poses[0].tolist()
+    row = row_name(0, episode.path) if episode.path else "row 0"
+    return f"{row}: the start pose ({x:.4g}, {z:.4g}, {angle:.4g})"
+
+
+def _inside(
+    episode: Episode, shape: Shape, parameters: Parameters, allowed: float | Tensor
+) -> tuple[float, str] | None:
+    """How deep [mm] the start pose is inside which terrain for the scene that it is least deep in;
+    None where it is no deeper than allowed [m] for any."""
     with torch.no_grad():
         scene = scene_from_parameters(
             shape, replace(parameters, latent=parameters.latent.float())
         ).double()
-        count = len(parameters.scale)
-        pose = episode.poses[0].expand(count, 3)
+        pose = episode.poses[0].expand(len(parameters.scale), 3)
         gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, pose)
     shallowest, terrain = gaps.amin(-1).min(-1)
     best = int(shallowest.argmax())
-    if float(shallowest[best]) > -OUTLINE_ERROR:
-        return
-    path = episode.path or "episode"
-    x, z, angle = episode.poses[0].tolist()
-    row = row_name(0, episode.path) if episode.path else "row 0"
-    depth, where = -1e3 * float(shallowest[best]), TERRAINS[int(terrain[best])]
-    raise EpisodeError(
-        path,
-        f"{row}: the start pose ({x:.4g}, {z:.4g}, {angle:.4g}) is at least"
-        f" {depth:.0f} mm inside the {where} for all of {count} {what}, expected a"
-        " pose free of contact",
-        remedy,
-    )
+    if bool((shallowest > -allowed).any()):
+        return None
+    return -1e3 * float(shallowest[best]), TERRAINS[int(terrain[best])]

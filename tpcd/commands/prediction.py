@@ -22,6 +22,7 @@ from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
 from tpcd.data.files import write_together
 from tpcd.data.table import encode_table
+from tpcd.files import read_json
 from tpcd.planar import wrap_angle
 from tpcd.predict import LEAST_STD, ContactPredictor
 from tpcd.prediction import CHANNELS, Prediction
@@ -36,6 +37,9 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
     found = []
     if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
         found.append(f"{run} was stopped before its last row; its belief is of the rows so far")
+    if (run / RESULTS_FILE).is_file():
+        contradicted = read_json(run / RESULTS_FILE).get("contradicted")
+        found += [f"{run} was learnt from {contradicted}"] if contradicted else []
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "
         found += [name + each for each in check_episode(episode) if each != NO_CONTACT]

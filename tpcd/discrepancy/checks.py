@@ -12,7 +12,13 @@ from pathlib import Path
 
 import torch
 
-from tpcd.data.checks import INVERTED, check_episode, inverted_sentence, wrench_slopes
+from tpcd.data.checks import (
+    INVERTED,
+    check_episode,
+    inverted_remedy,
+    inverted_sentence,
+    wrench_ratios,
+)
 from tpcd.data.episode import Episode
 from tpcd.data.files import locate
 from tpcd.data.header import Header, read_header
@@ -65,15 +71,10 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
 
 
 def _check_signs(path: Path, episode: Episode) -> None:
-    # Offsets and a turned sensor, which a diagnosis can name, are left aside; so is the torque,
-    # which may turn with the point that it is about.
-    forces = (episode.stiffness * (episode.poses - episode.commands))[:, :2]
-    design = torch.cat((forces, torch.ones_like(forces[:, :1])), dim=-1)
-    own = torch.linalg.lstsq(design, episode.wrenches[:, :2], driver="gelsd").solution
-    for axis, (name, slope) in enumerate(list(wrench_slopes(episode).items())[:2]):
-        if slope is not None and max(slope, float(own[axis, axis])) < INVERTED:
-            remedy = f"change the sign of the column {name}, or of its frame"
-            raise EpisodeError(path, inverted_sentence(name, slope), remedy)
+    # The torque may turn with the point that it is about.
+    for name, ratios in wrench_ratios(episode).items():
+        if name != "tau" and all(ratio < INVERTED for ratio in ratios):
+            raise EpisodeError(path, inverted_sentence(name, ratios[0]), inverted_remedy(name))
 
 
 def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:

@@ -77,8 +77,9 @@ def load_svg(
         if name in outlines:
             name = f"{name}-{index + 1}"
         points = _outer_loop(path, name, [flatten(loop, tolerance) for loop in subpaths])
-        holes = len(subpaths) - 1
-        notes = f"loops inside its outline, holes perhaps: {holes}, filled" if holes else ""
+        inside = len(subpaths) - 1
+        loops = "1 loop" if inside == 1 else f"{inside} loops"
+        notes = f"{loops} inside the outer one, taken for filled" if inside else ""
         outlines[name] = make_outline(name, points, path=path, source=path.name, notes=notes)
     return outlines
 

@@ -136,7 +136,7 @@ def test_a_stopped_run_goes_on_and_more_suites_may_follow(tmp_path: Path, workfl
     run_blind(replace(config, resume=True, quick=False, suites=("clean",), runs=1))
     assert len(workflow.asked) == 5
     assert {row["suite"] for row in results(config)["suites"]} == {"quick", "clean"}
-    with pytest.raises(RunError, match="another seed"):
+    with pytest.raises(RunError, match="whose seed is not the same"):
         run_blind(replace(config, resume=True, seed=1))
 
 

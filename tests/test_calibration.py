@@ -138,7 +138,7 @@ def test_a_run_can_be_continued_but_not_with_other_settings(tmp_path: Path) -> N
     assert results["runs"] == 2
     assert {"inside_50", "inside_90", "p_uniform"} <= set(results["table"][0])
     assert (out / "figures" / "ranks.png").is_file()
-    with pytest.raises(RunError, match="another steps"):
+    with pytest.raises(RunError, match="whose steps is not the same"):
         calibrate(Calibration(out=out, runs=2, steps=3, quick=True, particles=64))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from tpcd.effects.protocol import Effect
 from tpcd.simulator import StepSettings
+from tpcd.simulator.native import available
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,15 @@ class SamplerSettings:
         draws, flat_draws = (max(100, round(share * n)) for n in (self.draws, self.flat_draws))
         return replace(self, draws=draws, flat_draws=flat_draws)
 
+    def scaled(self, share: float) -> SamplerSettings:
+        """The same with such a share of all draws and of all points that climb, but no fewer than
+        `SamplerSettings()` has."""
+        least = SamplerSettings()
+        names = ("draws", "flat_starts", "flat_enough", "flat_tried", "flat_climbers")
+        names = (*names, "flat_draws", "prior_draws", "fresh_modes")
+        fewer = {n: max(getattr(least, n), round(share * getattr(self, n))) for n in names}
+        return replace(self, **fewer)
+
 
 CLOSING_SAMPLER = SamplerSettings(
     places=100,
@@ -105,6 +115,13 @@ CLOSING_SAMPLER = SamplerSettings(
     rough=False,
 )
 """Budget of the belief that is left once no more data are to come."""
+CLOSING_SHARE_WITHOUT_LOOPS = 0.125
+"""Share of it that is taken where the compiled loops are missing."""
+
+
+def default_closing() -> SamplerSettings:
+    """`CLOSING_SAMPLER`, or a share of it where numba is not installed and all takes longer."""
+    return CLOSING_SAMPLER if available() else CLOSING_SAMPLER.scaled(CLOSING_SHARE_WITHOUT_LOOPS)
 
 
 @dataclass(frozen=True)
@@ -113,7 +130,7 @@ class EstimatorSettings:
 
     sampler: SamplerSettings = field(default_factory=SamplerSettings)
     """Budget of the sampler after each transition."""
-    closing: SamplerSettings = CLOSING_SAMPLER
+    closing: SamplerSettings = field(default_factory=default_closing)
     """Budget once no more data are to come (see `refine`), for as many particles as the other."""
     closing_passes: int = 4
     """Times at most that mixtures in flat coordinates are adapted, each time from where draws of

@@ -20,6 +20,7 @@ from typing import Any
 from tqdm import tqdm
 
 from tpcd.belief.belief import Belief, EstimationStep
+from tpcd.belief.settings import CLOSING_SHARE_WITHOUT_LOOPS
 from tpcd.belief.state import EstimatorState, save_state
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
@@ -27,10 +28,16 @@ from tpcd.commands.summary import prior_summary, summarise
 from tpcd.data.episode import Episode
 from tpcd.exploration import Closing
 from tpcd.files import write_json, write_text
+from tpcd.simulator.native import available
 
 STEPS_FILE = "steps.jsonl"
 FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
+WITHOUT_LOOPS = (
+    "warning: numba is not installed, so that each step takes about 20 times as long and the last "
+    f"belief gets {CLOSING_SHARE_WITHOUT_LOOPS:.1%} of its draws; for the compiled loops: "
+    "pip install 'tpcd[fast]'"
+)
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
 
@@ -88,7 +95,10 @@ class EstimationRun:
         self._lines = self._open.enter_context(lines)
         bar = tqdm(total=self._total, initial=self._done, unit="step", disable=not self._show)
         self.bar = self._open.enter_context(bar)
-        self.bar.set_postfix_str("the first step also compiles, once on a machine")
+        if available():
+            self.bar.set_postfix_str("the first step also compiles, once on a machine")
+        elif self._show:
+            self.bar.write(WITHOUT_LOOPS, file=sys.stderr)
         return self
 
     def __exit__(self, *error: object) -> None:

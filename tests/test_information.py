@@ -16,6 +16,7 @@ from tpcd.information import (
     Outcomes,
     expected_information_gain,
     expected_variance,
+    field_gain,
     grid_commands,
     grid_gain,
     pair_log_likelihood,
@@ -42,6 +43,13 @@ def linear_outcomes(
     )
 
 
+def with_fields(outcomes: Outcomes, fields: Tensor) -> Outcomes:
+    """Outcomes that answer besides to numbers that no particle knows, for every B (c, k, j)."""
+    covariance = outcomes.factor @ outcomes.factor.mT + (fields @ fields.mT)[:, None]
+    spread = fields[:, None].expand(-1, outcomes.mean.shape[1], -1, -1)
+    return replace(outcomes, factor=torch.linalg.cholesky(covariance), field=spread)
+
+
 def random_outcomes(m: int, c: int, seed: int) -> Outcomes:
     generator = torch.Generator().manual_seed(seed)
     mean = torch.randn(c, m, 3, generator=generator, dtype=torch.float64)
@@ -49,6 +57,15 @@ def random_outcomes(m: int, c: int, seed: int) -> Outcomes:
     covariance = 0.1 * root @ root.mT + 0.05 * torch.eye(3, dtype=torch.float64)
     weights = torch.rand(m, generator=generator, dtype=torch.float64)
     return Outcomes(mean, torch.linalg.cholesky(covariance), (weights / weights.sum()).expand(c, m))
+
+
+def random_fields(m: int, c: int, seed: int) -> Outcomes:
+    """Random outcomes, in which each particle leaves something of its own open."""
+    outcomes = random_outcomes(m, c, seed)
+    generator = torch.Generator().manual_seed(seed + 1)
+    field = 0.3 * torch.randn(c, m, 3, 4, generator=generator, dtype=torch.float64)
+    covariance = outcomes.factor @ outcomes.factor.mT + field @ field.mT
+    return replace(outcomes, factor=torch.linalg.cholesky(covariance), field=field)
 
 
 def sensitivities(seed: int = 0) -> Tensor:
@@ -66,6 +83,19 @@ def test_the_gain_in_a_linear_normal_model_is_the_closed_form() -> None:
         torch.eye(3, dtype=torch.float64) + matrices @ matrices.mT / 0.5**2
     )
     torch.testing.assert_close(found, expected, atol=0.03, rtol=0.03)
+
+
+def test_the_gain_of_theta_and_field_in_a_linear_normal_model_is_the_closed_form() -> None:
+    """1/2 log det(I + (A A^T + B B^T) / s^2), whichever of both the particles know."""
+    theta = torch.randn(2500, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    known, open_ = sensitivities(), sensitivities(8).flip(0)
+    found = expected_information_gain(with_fields(linear_outcomes(theta, known, 0.5), open_))
+    both = torch.cat((known, open_), dim=-1)
+    one = torch.eye(3, dtype=torch.float64)
+    expected = 0.5 * torch.logdet(one + both @ both.mT / 0.5**2)
+    torch.testing.assert_close(found, expected, atol=0.03, rtol=0.03)
+    alone = with_fields(linear_outcomes(0.0 * theta[:3], known, 0.5), both)
+    torch.testing.assert_close(expected_information_gain(alone), expected)
 
 
 def test_the_variance_expected_in_a_linear_normal_model_is_the_closed_form() -> None:
@@ -119,15 +149,15 @@ def test_pairs_hold_the_normal_log_density() -> None:
 
 
 def _of_particles(outcomes: Outcomes, index: Tensor) -> Outcomes:
-    parts = (outcomes.mean, outcomes.factor, outcomes.weights)
-    return Outcomes(*(part[:, index] for part in parts))
+    return Outcomes(**{name: part[:, index] for name, part in vars(outcomes).items()})
 
 
 @settings(deadline=None, max_examples=25)
 @given(m=st.integers(2, 30), seed=st.integers(0, 10_000))
 def test_permuting_or_splitting_particles_changes_nothing(m: int, seed: int) -> None:
-    outcomes = random_outcomes(m, 2, seed)
+    outcomes = random_fields(m, 2, seed)
     values = torch.randn(m, 3, generator=torch.Generator().manual_seed(seed)).double()
+    field = torch.randn(m, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
     scale = torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
     order = torch.randperm(m, generator=torch.Generator().manual_seed(seed))
     turned = _of_particles(outcomes, order)
@@ -135,13 +165,15 @@ def test_permuting_or_splitting_particles_changes_nothing(m: int, seed: int) -> 
     split = _of_particles(outcomes, twice)
     split = replace(split, weights=split.weights / 2)
     gain = expected_information_gain(outcomes)
-    assert (gain >= 0).all()
-    assert (gain <= math.log(m) + 1e-9).all()
+    assert (gain >= field_gain(outcomes)).all()
+    assert (field_gain(outcomes) > 0).all()
+    assert (gain <= math.log(m) + field_gain(outcomes) + 1e-9).all()
     torch.testing.assert_close(expected_information_gain(turned), gain)
     torch.testing.assert_close(expected_information_gain(split), gain)
-    variance = expected_variance(outcomes, values, scale)
-    torch.testing.assert_close(expected_variance(turned, values[order], scale), variance)
-    torch.testing.assert_close(expected_variance(split, values[twice], scale), variance)
+    variance = expected_variance(outcomes, values, scale, field)
+    for same, index in ((turned, order), (split, twice)):
+        found = expected_variance(same, values[index], scale, field[index])
+        torch.testing.assert_close(found, variance)
 
 
 def test_a_command_that_cannot_inform_gains_nothing() -> None:
@@ -170,6 +202,30 @@ def test_expected_variance_in_a_linear_normal_model_is_the_closed_form() -> None
         covariance = task @ torch.linalg.solve(precision, task.T)
         expected = (covariance.diagonal() / scale**2).mean()
         assert float(found[c]) == pytest.approx(float(expected), rel=0.06)
+
+
+def test_variance_that_fields_leave_is_the_closed_form() -> None:
+    """What particles leave open has the covariance (I + B^T B / s^2)^-1 after the outcome."""
+    fields = sensitivities(2)
+    outcomes = linear_outcomes(torch.zeros(3, 2).double(), torch.zeros_like(fields), 0.5)
+    task = torch.tensor([[1.0, 0.0], [0.5, -2.0]], dtype=torch.float64)
+    scale = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    values, answers = torch.zeros(3, 2).double(), task.expand(3, 2, 2)
+    found = expected_variance(with_fields(outcomes, fields), values, scale, answers)
+    for c, matrix in enumerate(fields):
+        precision = torch.eye(2, dtype=torch.float64) + matrix.T @ matrix / 0.5**2
+        covariance = task @ torch.linalg.solve(precision, task.T)
+        assert float(found[c]) == pytest.approx(float((covariance.diagonal() / scale**2).mean()))
+
+
+def test_without_noise_the_gain_stays_finite() -> None:
+    """A field that is all of the covariance, in one direction as in all."""
+    for rank in (1, 3):
+        field = torch.eye(3, dtype=torch.float64)[:, :rank].expand(1, 2, 3, rank)
+        covariance = field @ field.mT + 1e-18 * torch.eye(3, dtype=torch.float64)
+        outcomes = replace(random_outcomes(2, 1, 0), factor=torch.linalg.cholesky(covariance))
+        gain = field_gain(replace(outcomes, field=field))
+        assert torch.isfinite(gain).all() and float(gain) > 5.0
 
 
 def test_weightless_particles_and_far_outcomes_stay_finite() -> None:

@@ -67,13 +67,14 @@ class ContactPredictor:
         previous: Float[Tensor, "n 3"] | None = None,
         pose_std: Float[Tensor, " 3"] | None = None,
         sensor_std: Float[Tensor, " 6"] | None = None,
+        keep_field: bool = False,
     ) -> Prediction:
         """Predict n transitions from pose and command [m, m, rad].
 
         `previous` is the command at which the arm rested in `pose` (None: without load).
         `pose_std` is the noise of `pose` where it was measured (None: exact). With
         `sensor_std`, noise of the six channels, the prediction is of what sensors will read;
-        without, of what will truly be.
+        without, of what will truly be. `keep_field` asks for `Prediction.component_field`.
         """
         start_variance = pose.new_zeros(3) if pose_std is None else pose_std.double() ** 2
         pose, command = pose.double(), command.double()
@@ -102,10 +103,10 @@ class ContactPredictor:
             self.belief.misfit, self._field_sd[:, None], settled[..., 2], transition
         )
         covariance = covariance + uncovered
+        field = rows @ self._field_root[:, None]
         if rows.shape[-1]:
             settled = settled + _shift(rows, self._field_mean[:, None], transition, gap)
-            scaled = rows @ self._field_root[:, None]
-            covariance = covariance + scaled @ scaled.mT
+            covariance = covariance + field @ field.mT
         usable = transition.status <= int(StepStatus.RELAXED)
         usable = usable & torch.isfinite(settled).all(-1)
         weights = torch.where(usable, self.weights[:, None], 0.0)
@@ -132,6 +133,7 @@ class ContactPredictor:
             sensor_variance=sensor.double(),
             component_wrench=wrench,
             wrench_matrix=None if found is None else found.matrix,
+            component_field=torch.where(keep[..., None], field, 0.0) if keep_field else None,
         )
 
     def _with_effects(

@@ -41,6 +41,9 @@ class Prediction:
     """Wrench given the particle; None where it is K (x' - u)."""
     wrench_matrix: Float[Tensor, "m n 3 3"] | None = None
     """How that wrench answers the settled pose; None where by K."""
+    component_field: Float[Tensor, "m n 3 j"] | None = None
+    """Factor L of the part L L^T of `component_covariance` that comes from what is not known yet of
+    the outline's misfit, in j standard normal numbers of the particle; None where not asked for."""
 
     @property
     def component_variance(self) -> Float[Tensor, "m n 3"]:

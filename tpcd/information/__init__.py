@@ -3,6 +3,7 @@
 from tpcd.information.gain import (
     expected_information_gain,
     expected_variance,
+    field_gain,
     pair_log_likelihood,
     reweight,
 )
@@ -15,6 +16,7 @@ __all__ = [
     "belief_outcomes",
     "expected_information_gain",
     "expected_variance",
+    "field_gain",
     "grid_commands",
     "grid_gain",
     "pair_log_likelihood",

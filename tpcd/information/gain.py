@@ -7,10 +7,14 @@ spherical cubature (McNamee and Stenger 1967; Arasaratnam and Haykin 2009): 2 k 
 distance sqrt(k), exact up to the third degree. In a linear normal model the divergence is
 quadratic in the noise, so that only the number of particles limits the answer. Nothing is
 drawn at random: permuting particles, or splitting one into two of half its weight, changes
-nothing.
+nothing. With m particles it does not exceed log m. Everything is in the log domain.
 
-With m particles no gain exceeds log m. Everything is in the log domain.
-Axes: c commands, m particles, n outcomes that are looked at, k channels.
+What a particle leaves open, the field along the outline, is learnt by Kalman's formulas once the
+particle is given. By the chain rule of information what an outcome tells of both is what it tells
+of the particle, and in the mean over particles what it tells of the field of each: of two normal
+distributions, half the logarithm of the ratio of determinants with the field and without.
+
+Axes: c commands, m particles, n outcomes that are looked at, k channels, j numbers of a field.
 """
 
 from __future__ import annotations
@@ -25,12 +29,15 @@ from tpcd.information.outcomes import Outcomes
 
 _NUMBERS_AT_ONCE = 4_000_000
 """Pairs of outcome and particle held in memory at once."""
+_LEAST_NOISE = 1e-12
+"""Share of a variance that is noise at least."""
 
 
 def expected_information_gain(
     outcomes: Outcomes, noise: Float[Tensor, "p k"] | None = None
 ) -> Float[Tensor, " c"]:
-    """Expected information gain of each command [nat], between 0 and log m.
+    """Expected information gain of each command [nat]: of the particle, between 0 and log m, and
+    of its field.
 
     `noise` are the points of the noise, in standard deviations (None: the cubature's).
     """
@@ -39,16 +46,33 @@ def expected_information_gain(
         log_likelihood, share = pair_log_likelihood(part, noise)
         posterior, log_norm = reweight(log_likelihood, part.weights)
         gains.append((share * ((posterior * log_likelihood).sum(-1) - log_norm)).sum(-1))
-    return torch.cat(gains).clamp_min(0.0)
+    return torch.cat(gains).clamp_min(0.0) + field_gain(outcomes)
+
+
+def field_gain(outcomes: Outcomes) -> Float[Tensor, " c"]:
+    """Information [nat] that each command is expected to bring of the particles' fields."""
+    if outcomes.field is None:
+        return outcomes.weights.new_zeros(len(outcomes.weights))
+    scaled = torch.linalg.solve_triangular(outcomes.factor, outcomes.field, upper=False)
+    # Covariance of the noise where that of the outcome is 1; rounding must not make it negative.
+    one = torch.eye(scaled.shape[-2], dtype=scaled.dtype, device=scaled.device)
+    noise = (1.0 + _LEAST_NOISE) * one - scaled @ scaled.mT
+    each = -torch.linalg.cholesky(noise).diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return (outcomes.weights * each).sum(-1).clamp_min(0.0)
 
 
 def expected_variance(
-    outcomes: Outcomes, values: Float[Tensor, "m v"], scale: Float[Tensor, " v"]
+    outcomes: Outcomes,
+    values: Float[Tensor, "m v"],
+    scale: Float[Tensor, " v"],
+    field: Float[Tensor, "m v j"] | None = None,
 ) -> Float[Tensor, " c"]:
     """Mean over v quantities of their variance expected after each command, in units of scale^2.
 
     `values` are what each particle says about the quantities, such as the predicted poses of
-    a task. What it says now has the variance of `values` under the weights.
+    a task. What it says now has the variance of `values` under the weights. `field` is how they
+    answer the same j numbers as the outcomes' fields; their variance within particles is then
+    added, as it is expected to be.
     """
     centred = (values - values.mean(0)) / scale
     expected = []
@@ -57,8 +81,19 @@ def expected_variance(
         posterior, _ = reweight(log_likelihood, part.weights)
         mean = posterior @ centred
         variance = (posterior @ centred.square() - mean.square()).clamp_min(0.0)
-        expected.append((share * variance.mean(-1)).sum(-1))
+        within = 0.0
+        if field is not None:
+            within = (part.weights * _field_left(part, field / scale[:, None])).sum(-1)
+        expected.append((share * variance.mean(-1)).sum(-1) + within)
     return torch.cat(expected)
+
+
+def _field_left(outcomes: Outcomes, field: Float[Tensor, "m v j"]) -> Float[Tensor, "c m"]:
+    """Mean over quantities of the variance that each particle's field leaves them afterwards."""
+    square = field.mT @ field / field.shape[1]
+    scaled = torch.linalg.solve_triangular(outcomes.factor, outcomes.field, upper=False)
+    now = square.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return now - ((scaled @ square) * scaled).sum((-2, -1))
 
 
 def pair_log_likelihood(
@@ -106,7 +141,10 @@ def cubature_points(k: int, dtype: torch.dtype = torch.float64) -> Float[Tensor,
 
 def split_commands(outcomes: Outcomes) -> list[Outcomes]:
     """The same in parts of a few commands, small enough for memory."""
-    _, m, k = outcomes.mean.shape
+    c, m, k = outcomes.mean.shape
     size = max(1, _NUMBERS_AT_ONCE // (2 * k * m * m))
-    parts = (value.split(size) for value in (outcomes.mean, outcomes.factor, outcomes.weights))
-    return [Outcomes(*part) for part in zip(*parts, strict=True)]
+    known = {name: value for name, value in vars(outcomes).items() if value is not None}
+    return [
+        Outcomes(**{name: value[first : first + size] for name, value in known.items()})
+        for first in range(0, c, size)
+    ]

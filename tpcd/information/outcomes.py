@@ -3,9 +3,10 @@
 The settled pose is measured twice, directly and through the wrench w = K (x' - u), which
 together are worth one reading of the pose with smaller noise. So an outcome has three
 channels (x, z, phi), and its covariance holds the outline misfit, the noise of the start pose
-and the noise of that reading.
+and the noise of that reading. Of the misfit a part is a field along the outline, which the reading
+teaches as it teaches theta; it is told apart from the noise.
 
-Axes: c commands, m particles, k channels.
+Axes: c commands, m particles, k channels, j numbers that the field of a particle depends on.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ class Outcomes:
     """Cholesky factors of the covariances, lower triangular."""
     weights: Float[Tensor, "c m"]
     """Weights of the particles for each command, which sum to 1."""
+    field: Float[Tensor, "c m k j"] | None = None
+    """How the outcome answers j standard normal numbers that a particle does not know, which the
+    outcome teaches; their part of the covariance is field @ field^T. None: everything that a
+    particle does not know is noise."""
 
 
 def belief_outcomes(
@@ -45,7 +50,9 @@ def belief_outcomes(
     """
     start = pose.expand(len(commands), 3)
     before = None if previous is None else previous.expand(len(commands), 3)
-    prediction = predictor.predict(start, commands, before, pose_std=sensor_std[:3])
+    prediction = predictor.predict(
+        start, commands, before, pose_std=sensor_std[:3], keep_field=True
+    )
     reading = torch.diag(reading_variance(sensor_std, prediction.stiffness))
     covariance = prediction.component_covariance.transpose(0, 1) + reading
     mean = prediction.component_mean.transpose(0, 1)
@@ -55,7 +62,9 @@ def belief_outcomes(
         mean = torch.where(none[:, None, None], 0.0, mean)
         weights = torch.where(none[:, None], 1.0 / weights.shape[1], weights)
     factor = torch.linalg.cholesky(covariance)
-    return Outcomes(mean, factor, weights), prediction
+    field = prediction.component_field
+    field = None if field is None else field.transpose(0, 1)
+    return Outcomes(mean, factor, weights, field), prediction
 
 
 def reading_variance(

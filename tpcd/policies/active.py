@@ -64,11 +64,16 @@ class Task:
     tolerance: tuple[float, float, float] = (1e-3, 1e-3, 5e-3)
     """Errors of the settled pose that count alike [m, m, rad]; forces follow from them."""
 
-    def answers(self, predictor: ContactPredictor) -> Float[Tensor, "m v"]:
-        """What each particle predicts, in units of the tolerance."""
-        prediction = predictor.predict(self.poses, self.commands, self.previous)
+    def answers(
+        self, predictor: ContactPredictor
+    ) -> tuple[Float[Tensor, "m v"], Float[Tensor, "m v j"] | None]:
+        """What particles predict, and how that answers their fields, in units of the tolerance."""
+        prediction = predictor.predict(self.poses, self.commands, self.previous, keep_field=True)
         scale = torch.tensor(self.tolerance, dtype=torch.float64)
-        return (prediction.component_mean / scale).flatten(1)
+        field = prediction.component_field
+        if field is not None:
+            field = (field / scale[:, None]).flatten(1, 2)
+        return (prediction.component_mean / scale).flatten(1), field
 
     def predicted_error(self, predictor: ContactPredictor) -> Float[Tensor, " 6"]:
         """Root mean square error that the belief expects of its predictions, each channel."""
@@ -185,10 +190,12 @@ class ActivePolicy:
             excess[far] = self._limits.excess_probability(nearer)
         if self._task is None:
             return expected_information_gain(outcomes) / away**self._settings.stride_cost, excess
-        values = self._task.answers(predictor)
+        values, field = self._task.answers(predictor)
         weights = predictor.weights[:, None]
         now = (weights * (values - (weights * values).sum(0)).square()).sum(0).mean()
-        fall = now - expected_variance(outcomes, values, torch.ones_like(values[0]))
+        if field is not None:
+            now = now + (weights * field.square().sum(-1)).sum(0).mean()
+        fall = now - expected_variance(outcomes, values, torch.ones_like(values[0]), field)
         return fall / away**self._settings.stride_cost, excess
 
 

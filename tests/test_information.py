@@ -204,6 +204,19 @@ def test_expected_variance_in_a_linear_normal_model_is_the_closed_form() -> None
         assert float(found[c]) == pytest.approx(float(expected), rel=0.06)
 
 
+def test_what_two_outcomes_tell_of_a_field_adds_up_to_what_both_together_do() -> None:
+    fields = sensitivities(3)
+    outcomes = linear_outcomes(torch.zeros(2, 2).double(), torch.zeros_like(fields), 0.5)
+    outcomes = with_fields(outcomes, fields)
+    for c, matrix in enumerate(fields):
+        second = field_gain(outcomes.after(outcomes, c))
+        for other, gain in zip(fields, second, strict=True):
+            both = torch.cat((matrix, other))
+            one = torch.eye(6, dtype=torch.float64)
+            expected = 0.5 * torch.logdet(one + both @ both.mT / 0.5**2)
+            assert float(field_gain(outcomes)[c] + gain) == pytest.approx(float(expected))
+
+
 def test_variance_that_fields_leave_is_the_closed_form() -> None:
     """What particles leave open has the covariance (I + B^T B / s^2)^-1 after the outcome."""
     fields = sensitivities(2)

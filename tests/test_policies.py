@@ -270,6 +270,42 @@ def test_a_task_makes_the_search_learn_what_the_task_needs(
     assert choice.gain == pytest.approx(now, rel=0.3)
 
 
+def test_what_is_left_to_learn_of_the_outline_draws_the_search_there(
+    belief: Belief, episode: Episode
+) -> None:
+    """With theta known and the field of one sense of turning learnt, the other one is tried."""
+    known = known_but(belief, "friction")
+    nothing = torch.zeros_like(known.misfit_covariance)
+    vectors = known.vectors[:1].expand_as(known.vectors)
+    known = replace(known, vectors=vectors, misfit_covariance=nothing)
+    field, terrains = known.misfit, known.misfit_covariance.shape[-1] // known.misfit.bumps
+    nodes = field.width * (torch.arange(field.bumps) - (field.bumps - 1) / 2).double()
+    situation = Situation(row_at(episode, (0.0, 0.08, 0.0)), known)
+    choice = ActivePolicy(Limits(), SMALL).choose(situation, torch.Generator().manual_seed(0))
+    assert choice.gain is not None and choice.gain < 1e-2
+    for side in (1.0, -1.0):
+        variance = (
+            torch.where(side * nodes > 0.5 * field.width, 1e-12, 4e-7).double().repeat(terrains)
+        )
+        open_ = replace(known, misfit_covariance=variance.diag().expand_as(known.misfit_covariance))
+        choice = ActivePolicy(Limits(), SMALL).choose(
+            replace(situation, belief=open_), torch.Generator().manual_seed(0)
+        )
+        assert choice.gain is not None and choice.gain > 0.5
+        assert side * float(choice.command[2]) < 0.05
+        # A task is served by it too.
+        turned = torch.tensor([[0.0, 0.02, -0.14 * side]], dtype=torch.float64)
+        task = Task(situation.episode.poses, turned)
+        before = task.predicted_error(ContactPredictor(open_))[:3]
+        now = float((before / torch.tensor(task.tolerance)).square().mean())
+        assert before[1] > 4e-4
+        choice = ActivePolicy(Limits(), SMALL, task).choose(
+            replace(situation, belief=open_), torch.Generator().manual_seed(0)
+        )
+        assert choice.gain is not None and 0.4 * now < choice.gain < now
+        assert side * float(choice.command[2]) < -0.05
+
+
 def test_scripts_taken_up_again_give_the_same_commands(episode: Episode) -> None:
     def make():
         return rich_exploration(torch.Generator().manual_seed(5))

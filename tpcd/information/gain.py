@@ -25,12 +25,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.information.outcomes import Outcomes
+from tpcd.information.outcomes import LEAST_NOISE, Outcomes
 
 _NUMBERS_AT_ONCE = 4_000_000
 """Pairs of outcome and particle held in memory at once."""
-_LEAST_NOISE = 1e-12
-"""Share of a variance that is noise at least."""
 
 
 def expected_information_gain(
@@ -54,9 +52,9 @@ def field_gain(outcomes: Outcomes) -> Float[Tensor, " c"]:
     if outcomes.field is None:
         return outcomes.weights.new_zeros(len(outcomes.weights))
     scaled = torch.linalg.solve_triangular(outcomes.factor, outcomes.field, upper=False)
-    # Covariance of the noise where that of the outcome is 1; rounding must not make it negative.
+    # Covariance of the noise where that of the outcome is 1.
     one = torch.eye(scaled.shape[-2], dtype=scaled.dtype, device=scaled.device)
-    noise = (1.0 + _LEAST_NOISE) * one - scaled @ scaled.mT
+    noise = (1.0 + LEAST_NOISE) * one - scaled @ scaled.mT
     each = -torch.linalg.cholesky(noise).diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return (outcomes.weights * each).sum(-1).clamp_min(0.0)
 

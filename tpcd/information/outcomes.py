@@ -11,7 +11,7 @@ Axes: c commands, m particles, k channels, j numbers that the field of a particl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -19,6 +19,9 @@ from torch import Tensor
 
 from tpcd.predict import ContactPredictor
 from tpcd.prediction import Prediction
+
+LEAST_NOISE = 1e-12
+"""Share of a variance that is noise at least, lest rounding make it negative."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,19 @@ class Outcomes:
     """How the outcome answers j standard normal numbers that a particle does not know, which the
     outcome teaches; their part of the covariance is field @ field^T. None: everything that a
     particle does not know is noise."""
+
+    def after(self, first: Outcomes, command: int) -> Outcomes:
+        """The same where the outcome of a command of `first` has taught the particles' fields."""
+        if self.field is None or first.field is None:
+            return self
+        taught = torch.linalg.solve_triangular(
+            first.factor[command], first.field[command], upper=False
+        )
+        gram = taught.mT @ taught
+        one = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+        left = torch.linalg.cholesky((1.0 + LEAST_NOISE) * one - gram)
+        covariance = self.factor @ self.factor.mT - self.field @ gram @ self.field.mT
+        return replace(self, factor=torch.linalg.cholesky(covariance), field=self.field @ left)
 
 
 def belief_outcomes(

@@ -1,9 +1,9 @@
 """Look-ahead: what a command is worth together with the best one after it.
 
-For each command some outcomes are drawn from the belief. Each gives new weights and a new
-pose, from which goals within reach are rated again; the best of them is what the second step
-adds. One more step of the search is one factor of cost, so this is an option and not the
-default.
+For each command some outcomes are drawn from the belief. Each gives new weights, less to learn
+of the outline's field, and a new pose, from which goals within reach are rated again; the best
+of them is what the second step adds. One more step of the search is one factor of cost, so this
+is an option and not the default.
 """
 
 from __future__ import annotations
@@ -57,6 +57,7 @@ def second_step_gain(
             weights = (found.weights > 0) * after
             total = weights.sum(-1, keepdim=True)
             weights = torch.where(total > 0, weights / total, found.weights)
-            best.append(expected_information_gain(replace(found, weights=weights)).max())
+            found = replace(found, weights=weights).after(outcomes, c)
+            best.append(expected_information_gain(found).max())
         values.append(torch.stack(best).mean())
     return torch.stack(values)

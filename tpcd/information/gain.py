@@ -127,8 +127,11 @@ def reweight(
 ) -> tuple[Float[Tensor, "c n m"], Float[Tensor, "c n"]]:
     """Weights after each outcome, and the log of what they were divided by."""
     joint = log_likelihood + weights.log()[:, None]
-    log_norm = torch.logsumexp(joint, dim=-1)
-    return (joint - log_norm[..., None]).exp(), log_norm
+    # As logsumexp does it, with the exponentials taken once for both.
+    peak = joint.amax(-1, keepdim=True)
+    posterior = joint.sub_(peak).exp_()
+    total = posterior.sum(-1, keepdim=True)
+    return posterior.div_(total), (peak + total.log())[..., 0]
 
 
 def cubature_points(k: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "p k"]:

@@ -81,7 +81,7 @@ def evaluate_physical(config: Physical) -> None:
 
     torch.set_num_threads(1)
     if config.resume:
-        folder = continue_run(config.out, config, free=("out", "resume", "overwrite"))
+        folder = continue_run(config.out, config, free=("out",))
     else:
         folder = open_run(config.out, "python -m eval.physical", config, config.overwrite)
     rows: list[dict[str, Any]] = [PAPER]

@@ -106,7 +106,7 @@ def evaluate_unseen(config: Unseen) -> None:
     names = config.objects or (QUICK if config.quick else (*SEEN, *UNSEEN))
     priors = config.priors[:1] if config.quick else config.priors
     if config.resume:
-        folder = continue_run(config.out, config, free=("out", "resume", "overwrite"))
+        folder = continue_run(config.out, config, free=("out",))
     else:
         folder = open_run(config.out, "python -m eval.unseen", config, config.overwrite)
     path = folder / "cells.jsonl"

@@ -40,9 +40,9 @@ def emulate(config: Emulation) -> None:
     import yaml
 
     from tpcd.files import write_text
-    from tpcd.results import check_target
     from tpcd.robot.emulator import emulated_scene
     from tpcd.robot.emulator.server import Server
+    from tpcd.targets import check_target
 
     torch.set_num_threads(1)
     if config.truth is not None:

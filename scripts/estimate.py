@@ -84,7 +84,7 @@ def estimate_episode(config: Estimate) -> None:
         if (config.out / RESULTS_FILE).is_file():
             raise RunError(config.out, "is finished", "leave out --resume and name a new folder")
         # The state knows its data and the run its model, so files may have been moved.
-        free = ("episode", "model", "out", "resume")
+        free = ("episode", "model", "out")
         opened = resumed_run(config.out, config, free)
     else:
         opened = run_folder(

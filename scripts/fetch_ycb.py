@@ -50,10 +50,10 @@ def fetch(config: Fetching) -> int:
     from tqdm import tqdm
 
     from tpcd.errors import FileError
-    from tpcd.results import check_target
     from tpcd.shape.download import Patience
     from tpcd.shape.ycb import GRASPABLE_21
     from tpcd.shape.ycb_archive import fetch_object, write_slices
+    from tpcd.targets import check_target
 
     check_target(config.folder / "slices.npz", overwrite=True)
     names = config.objects or GRASPABLE_21

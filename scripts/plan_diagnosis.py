@@ -112,7 +112,7 @@ def _plan(config: Planning) -> None:
     import torch
 
     from tpcd.files import write_text
-    from tpcd.results import check_target
+    from tpcd.targets import check_target
     from tpcd.truth.diagnosis_plan import diagnosis_plan
 
     assert config.out is not None

@@ -61,7 +61,8 @@ def predict_episodes(config: Predict) -> None:
     from tpcd.data.files import TABLE_SUFFIXES
     from tpcd.errors import RunError
     from tpcd.predict import ContactPredictor
-    from tpcd.results import check_target, format_table
+    from tpcd.results import format_table
+    from tpcd.targets import check_target
     from tpcd.truth.recording import has_truth, read_truth
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.

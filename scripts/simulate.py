@@ -135,8 +135,8 @@ def simulate(config: Simulation) -> None:
     from tpcd.files import to_plain
     from tpcd.parameters import SCENE_NAMES
     from tpcd.random import stream
-    from tpcd.results import check_target
     from tpcd.shape.named import find_outline
+    from tpcd.targets import check_target
     from tpcd.truth.recording import make_motion, record, recording_contents
     from tpcd.truth.scene import draw_scene, make_truth
     from tpcd.versions import versions

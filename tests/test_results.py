@@ -14,7 +14,8 @@ import yaml
 
 from tpcd.errors import FileError, RunError
 from tpcd.files import read_json, write_json
-from tpcd.results import check_target, format_table, open_run, run_folder, write_results
+from tpcd.results import format_table, open_run, run_folder, write_results
+from tpcd.targets import check_target
 
 
 @dataclass(frozen=True)

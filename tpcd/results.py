@@ -17,12 +17,12 @@ from typing import Any
 
 from tpcd.errors import RunError
 from tpcd.files import read_json, to_plain, write_json, write_text
+from tpcd.targets import ELSEWHERE, check_place
 from tpcd.versions import versions
 
 CONFIG_FILE = "config.yaml"
 VERSIONS_FILE = "versions.json"
 RESULTS_FILE = "results.json"
-ELSEWHERE = "name a place where you may write"
 
 
 def open_run(
@@ -103,44 +103,12 @@ def _interrupted(path: str | Path, error: KeyboardInterrupt) -> KeyboardInterrup
     return KeyboardInterrupt(f"{said}{path} goes on with --resume")
 
 
-def check_target(
-    path: str | Path, overwrite: bool = False, inputs: Sequence[str | Path] = ()
-) -> None:
-    """Refuse a file that could not be written in the end, before the work begins.
-
-    Raises `RunError` where it exists and `overwrite` is false, is a folder or one of the `inputs`,
-    or lies where nothing can be written.
-    """
-    path = Path(path)
-    if any(Path(name).resolve() == path.resolve() for name in inputs):
-        raise RunError(path, "is what the command reads", "choose another name")
-    if path.is_dir():
-        raise RunError(path, "is a folder", "name a file")
-    if path.exists() and not overwrite:
-        raise RunError(path, "exists already", "choose another name or pass --overwrite")
-    _check_place(path.parent)
-
-
-def check_folder(path: str | Path, overwrite: bool = False) -> None:
-    """Refuse a folder that could not be written in the end, before the work begins.
-
-    Raises `RunError` where it is a file, holds something and `overwrite` is false, or lies where
-    nothing can be written.
-    """
-    folder = Path(path)
-    if folder.exists() and not folder.is_dir():
-        raise RunError(folder, "is a file", "name a folder")
-    if not overwrite and folder.is_dir() and any(folder.iterdir()):
-        raise RunError(folder, "is not empty", "name a new folder or pass --overwrite")
-    _check_place(folder)
-
-
 def _holds_run(folder: Path, overwrite: bool, resumable: str | None = None) -> bool:
     """Whether an earlier run is to be replaced; `RunError` where nothing may be put there."""
     if folder.exists() and not folder.is_dir():
         raise RunError(folder, "is a file", "name a folder for the results")
     if not folder.is_dir() or not any(folder.iterdir()):
-        _check_place(folder)
+        check_place(folder)
         return False
     if not overwrite:
         stopped = bool(resumable) and (folder / str(resumable)).exists()
@@ -173,15 +141,6 @@ def _spare_inputs(folder: Path, config: Mapping[str, Any] | Any) -> None:
 def _episode_there(place: Path) -> bool:
     """Whether the path is an episode's name without its suffix."""
     return any(place.with_name(place.name + suffix).exists() for suffix in (".csv", ".parquet"))
-
-
-def _check_place(folder: Path) -> None:
-    """Refuse a folder that neither is one to write to nor can be made."""
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not there.is_dir():
-        raise RunError(folder, f"cannot be made: {there} is a file", "name another folder")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise RunError(folder, f"cannot be written: no permission in {there}", ELSEWHERE)
 
 
 def _started(folder: Path, command: str, config: Mapping[str, Any] | Any) -> Path:

@@ -13,7 +13,8 @@ from pathlib import Path
 from tpcd.cli import run
 from tpcd.errors import RunError
 from tpcd.files import read_json
-from tpcd.results import check_folder, resumed_run, run_folder, write_results
+from tpcd.results import resumed_run, run_folder, write_results
+from tpcd.targets import check_folder
 from training.config import TrainingConfig
 
 

@@ -78,7 +78,7 @@ def run_blind(config: Blind) -> None:
         if config.resume:
             # More cases may be asked of an earlier run; what is in a case must stay the same.
             cases = ("suites", "runs", "quick")
-            continue_run(config.out, config, ("out", "resume", "overwrite", "workers", *cases))
+            continue_run(config.out, config, ("out", "workers", *cases))
         else:
             open_run(config.out, "python -m eval.blind", config, config.overwrite)
     # Workers end at different times; the first waits for the last.

@@ -125,7 +125,7 @@ def make_table(config: Table) -> None:
         if config.resume:
             # More cells may be asked of an earlier run; what is in a cell must stay the same.
             cells = ("truths", "objects", "rows", "seeds")
-            continue_run(config.out, config, ("out", "resume", "overwrite", "workers", *cells))
+            continue_run(config.out, config, ("out", "workers", *cells))
         else:
             open_run(config.out, "python -m eval.table", config, config.overwrite)
     # Workers end at different times; the first waits for the last.

@@ -51,7 +51,7 @@ def open_diagnosis(
         return run_folder(folder, "scripts/diagnose.py", config, overwrite, resumable=FITS_FOLDER)
     if (folder / RESULTS_FILE).is_file():
         raise RunError(folder, "has its verdict", "leave out --resume")
-    return resumed_run(folder, config, ("out", "resume"))
+    return resumed_run(folder, config, ("out",))
 
 
 def fits_of(folder: Path, code: Sequence[Path]) -> Memory:

@@ -29,7 +29,7 @@ from tpcd.robot.protocol import Robot
 from tpcd.shape.checkpoint import load_prior
 
 EPISODE_NAME = "explore"
-MAY_CHANGE = ("model", "out", "resume", "overwrite", "steps", "stop_gain", "stop_error")
+MAY_CHANGE = ("model", "out", "steps", "stop_gain", "stop_error")
 """Options with which a stopped run may go on in another way."""
 
 

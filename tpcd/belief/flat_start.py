@@ -31,7 +31,7 @@ _TRYING_POWER = 0.1
 _CLIMBING_POWER = 0.2
 """of the posterior there, by which those are chosen that climb. The basin of a narrow mode is far
 below its top, and above its surroundings. Chosen, with the numbers of the closing draws, on six
-recordings on which modes had been missed (eval/README.md, Calibration)."""
+recordings on which modes had been missed (eval/EVIDENCE.md, Calibration)."""
 _WEAKER = 0.7
 """Factor between one power and the next."""
 

@@ -22,7 +22,7 @@ from tpcd.belief.history import history_of
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.contact import column_scene, scene_from_parameters
-from tpcd.information import Outcomes, expected_information_gain
+from tpcd.information import Outcomes, expected_information_gain, expected_variance
 from tpcd.parameters import Parameters
 from tpcd.qp import Status, solve
 from tpcd.shape.builtin import builtin_outlines
@@ -179,6 +179,17 @@ def test_gains_are_the_same(device: torch.device) -> None:
     mean = torch.randn(4, 50, 3, generator=generator, dtype=torch.float64)
     factor = torch.eye(3, dtype=torch.float64).expand(4, 50, 3, 3) * vector(0.3, 0.4, 0.5)
     even = torch.full((4, 50), 0.02, dtype=torch.float64)
-    outcomes = Outcomes(mean, factor, even)
-    expected = expected_information_gain(outcomes)
-    same(expected_information_gain(moved(outcomes, device)), expected, 1e-10)
+    field = 0.2 * torch.randn(4, 50, 3, 6, generator=generator, dtype=torch.float64)
+    outcomes = Outcomes(
+        mean, torch.linalg.cholesky(factor @ factor.mT + field @ field.mT), even, field
+    )
+    after = outcomes.after(outcomes, 1, mean[1, 2])
+    values, answers = mean[0], field[0]
+    elsewhere = moved(outcomes, device)
+    for here, there in (
+        (outcomes, elsewhere),
+        (after, elsewhere.after(elsewhere, 1, mean[1, 2].to(device))),
+    ):
+        same(expected_information_gain(there), expected_information_gain(here), 1e-10)
+        found = expected_variance(there, values.to(device), answers.to(device))
+        same(found, expected_variance(here, values, answers), 1e-10)

@@ -270,29 +270,59 @@ def test_a_task_makes_the_search_learn_what_the_task_needs(
     assert choice.gain == pytest.approx(now, rel=0.3)
 
 
+def known_but_fields(belief: Belief, variance: Tensor) -> Belief:
+    """The belief with theta known, and what is not known of each field's coefficients [m^2]."""
+    known = known_but(belief, "friction")
+    vectors = known.vectors[:1].expand_as(known.vectors)
+    covariance = variance.double().diag().expand_as(known.misfit_covariance)
+    return replace(known, vectors=vectors, misfit_covariance=covariance)
+
+
+def test_looking_ahead_a_reading_teaches_less_of_the_outline_once_more(
+    belief: Belief, episode: Episode
+) -> None:
+    """The first press, and the second after a press and after a move in free space."""
+    size = belief.misfit_covariance.shape[-1]
+    predictor = ContactPredictor(known_but_fields(belief, torch.full((size,), 4e-7)), 30)
+    start = row_at(episode, (0.0, 0.15, 0.0))
+    press, free = (0.0, -0.05, 0.0), (0.0, 0.16, 0.0)
+    commands = torch.tensor([press, free], dtype=torch.float64)
+    outcomes, _ = belief_outcomes(
+        predictor, start.poses[0], commands, start.commands[0], episode.sensor_std
+    )
+    first = expected_information_gain(outcomes)
+    again, anew = second_step_gain(
+        predictor,
+        outcomes,
+        commands,
+        episode.sensor_std,
+        lambda _: (commands[0], commands[0]),
+        torch.Generator().manual_seed(0),
+    )
+    assert first[0] > 0.8 and first[1] < 1e-6
+    assert float(anew) == pytest.approx(float(first[0]), rel=0.05)
+    assert 0.1 * first[0] < again < 0.5 * first[0]
+
+
 def test_what_is_left_to_learn_of_the_outline_draws_the_search_there(
     belief: Belief, episode: Episode
 ) -> None:
     """With theta known and the field of one sense of turning learnt, the other one is tried."""
-    known = known_but(belief, "friction")
-    nothing = torch.zeros_like(known.misfit_covariance)
-    vectors = known.vectors[:1].expand_as(known.vectors)
-    known = replace(known, vectors=vectors, misfit_covariance=nothing)
-    field, terrains = known.misfit, known.misfit_covariance.shape[-1] // known.misfit.bumps
+    size = belief.misfit_covariance.shape[-1]
+    known = known_but_fields(belief, torch.zeros(size))
+    field, terrains = known.misfit, size // known.misfit.bumps
     nodes = field.width * (torch.arange(field.bumps) - (field.bumps - 1) / 2).double()
     situation = Situation(row_at(episode, (0.0, 0.08, 0.0)), known)
     choice = ActivePolicy(Limits(), SMALL).choose(situation, torch.Generator().manual_seed(0))
     assert choice.gain is not None and choice.gain < 1e-2
     for side in (1.0, -1.0):
-        variance = (
-            torch.where(side * nodes > 0.5 * field.width, 1e-12, 4e-7).double().repeat(terrains)
-        )
-        open_ = replace(known, misfit_covariance=variance.diag().expand_as(known.misfit_covariance))
+        variance = torch.where(side * nodes > 0.5 * field.width, 1e-12, 4e-7)
+        open_ = known_but_fields(belief, variance.repeat(terrains))
         choice = ActivePolicy(Limits(), SMALL).choose(
             replace(situation, belief=open_), torch.Generator().manual_seed(0)
         )
         assert choice.gain is not None and choice.gain > 0.5
-        assert side * float(choice.command[2]) < 0.05
+        assert side * float(choice.command[2]) < 0.0
         # A task is served by it too.
         turned = torch.tensor([[0.0, 0.02, -0.14 * side]], dtype=torch.float64)
         task = Task(situation.episode.poses, turned)

@@ -6,7 +6,8 @@ The paper's Algorithm 2 weighs 27 commands with a fifth of the filter's particle
 with that and with all of them, over the number of particles and the number of commands, beside
 a choice of our own policy. The ranking is tested on beliefs met while exploring, the prior
 included: goals near and far are ranked by the estimator with few particles, and by a reference
-with all of them and many draws of the noise. Regret is the gain that taking the estimator's best
+with all of them and many draws of the noise (the part that is of the outline's misfit is a closed
+form in both). Regret is the gain that taking the estimator's best
 loses.
 """
 

@@ -88,8 +88,9 @@ class SamplerSettings:
         return replace(self, draws=draws, flat_draws=flat_draws)
 
     def scaled(self, share: float) -> SamplerSettings:
-        """The same with such a share of all draws and of all points that climb, but no fewer than
-        `SamplerSettings()` has."""
+        """The same with such a share of the draws in flat coordinates, of those that count and of
+        the points that climb, but no fewer than `SamplerSettings()` has. The rounds before, from
+        `places`, stay."""
         least = SamplerSettings()
         names = ("draws", "flat_starts", "flat_enough", "flat_tried", "flat_climbers")
         names = (*names, "flat_draws", "prior_draws", "fresh_modes")

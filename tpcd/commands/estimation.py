@@ -33,13 +33,13 @@ from tpcd.simulator.native import available
 STEPS_FILE = "steps.jsonl"
 FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
-WITHOUT_LOOPS = (
-    "warning: numba is not installed, so that each step takes about 20 times as long and the last "
-    f"belief gets {CLOSING_SHARE_WITHOUT_LOOPS:.1%} of its draws; for the compiled loops: "
-    "pip install 'tpcd[fast]'"
-)
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
+WITHOUT_LOOPS = "warning: numba is not installed, so that each step takes about 20 times as long"
+FEWER_DRAWS = f" and the last belief gets {CLOSING_SHARE_WITHOUT_LOOPS:.1%} of its draws"
+LOOPS = "; for the compiled loops: pip install 'tpcd[fast]'"
+"""What is told of the compiled loops where they are missing; the middle part where there is a
+closing."""
 
 
 def run_estimation(
@@ -98,7 +98,8 @@ class EstimationRun:
         if available():
             self.bar.set_postfix_str("the first step also compiles, once on a machine")
         elif self._show:
-            self.bar.write(WITHOUT_LOOPS, file=sys.stderr)
+            fewer = FEWER_DRAWS if self._closing else ""
+            self.bar.write(WITHOUT_LOOPS + fewer + LOOPS, file=sys.stderr)
         return self
 
     def __exit__(self, *error: object) -> None:

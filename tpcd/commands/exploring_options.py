@@ -26,8 +26,9 @@ class ExploringOptions:
     steps: int = 15
     """Moves at most."""
     stop_gain: float | None = None
-    """Stop before a command that promises less than this [nat; with --task: mean square of the
-    tolerance 1 mm, 1 mm, 5 mrad]; a goal n steps away counts over the root of n."""
+    """Stop before a command that promises less than this [nat, of theta and of what the outline
+    prior misses; with --task: mean square of the tolerance 1 mm, 1 mm, 5 mrad]; a goal n steps
+    away counts over the root of n."""
     task: Path | None = None
     """Episode whose motions are to be predicted: learn what they depend on."""
     stop_error: float | None = None

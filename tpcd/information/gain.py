@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.information.outcomes import LEAST_NOISE, Outcomes
+from tpcd.information.outcomes import Outcomes, root_of_rest
 
 _NUMBERS_AT_ONCE = 4_000_000
 """Pairs of outcome and particle held in memory at once."""
@@ -51,47 +51,10 @@ def field_gain(outcomes: Outcomes) -> Float[Tensor, " c"]:
     """Information [nat] that each command is expected to bring of the particles' fields."""
     if outcomes.field is None:
         return outcomes.weights.new_zeros(len(outcomes.weights))
-    scaled = torch.linalg.solve_triangular(outcomes.factor, outcomes.field, upper=False)
-    # Covariance of the noise where that of the outcome is 1.
-    one = torch.eye(scaled.shape[-2], dtype=scaled.dtype, device=scaled.device)
-    noise = (1.0 + LEAST_NOISE) * one - scaled @ scaled.mT
-    each = -torch.linalg.cholesky(noise).diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    # Of the noise, in units in which the covariance of the outcome is 1.
+    noise = root_of_rest(outcomes.field_share @ outcomes.field_share.mT)
+    each = -noise.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return (outcomes.weights * each).sum(-1).clamp_min(0.0)
-
-
-def expected_variance(
-    outcomes: Outcomes,
-    values: Float[Tensor, "m v"],
-    scale: Float[Tensor, " v"],
-    field: Float[Tensor, "m v j"] | None = None,
-) -> Float[Tensor, " c"]:
-    """Mean over v quantities of their variance expected after each command, in units of scale^2.
-
-    `values` are what each particle says about the quantities, such as the predicted poses of
-    a task. What it says now has the variance of `values` under the weights. `field` is how they
-    answer the same j numbers as the outcomes' fields; their variance within particles is then
-    added, as it is expected to be.
-    """
-    centred = (values - values.mean(0)) / scale
-    expected = []
-    for part in split_commands(outcomes):
-        log_likelihood, share = pair_log_likelihood(part)
-        posterior, _ = reweight(log_likelihood, part.weights)
-        mean = posterior @ centred
-        variance = (posterior @ centred.square() - mean.square()).clamp_min(0.0)
-        within = 0.0
-        if field is not None:
-            within = (part.weights * _field_left(part, field / scale[:, None])).sum(-1)
-        expected.append((share * variance.mean(-1)).sum(-1) + within)
-    return torch.cat(expected)
-
-
-def _field_left(outcomes: Outcomes, field: Float[Tensor, "m v j"]) -> Float[Tensor, "c m"]:
-    """Mean over quantities of the variance that each particle's field leaves them afterwards."""
-    square = field.mT @ field / field.shape[1]
-    scaled = torch.linalg.solve_triangular(outcomes.factor, outcomes.field, upper=False)
-    now = square.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return now - ((scaled @ square) * scaled).sum((-2, -1))
 
 
 def pair_log_likelihood(
@@ -100,11 +63,7 @@ def pair_log_likelihood(
     """Log likelihood of each outcome that is looked at under every particle, up to a constant
     common to all, and the probability of the outcome."""
     c, m, k = outcomes.mean.shape
-    centre = (outcomes.weights[..., None] * outcomes.mean).sum(1, keepdim=True)
-    mean = outcomes.mean - centre
-    points = cubature_points(k, mean.dtype).to(mean.device) if noise is None else noise
-    drawn = mean[:, :, None] + torch.einsum("cmij,pj->cmpi", outcomes.factor, points)
-    drawn = drawn.flatten(1, 2)
+    drawn, mean = outcome_points(outcomes, noise)
     # y^T P y - 2 (P mean)^T y + mean^T P mean as one matrix product over monomials of y.
     precision = torch.cholesky_inverse(outcomes.factor)
     pulled = (precision @ mean[..., None])[..., 0]
@@ -118,8 +77,21 @@ def pair_log_likelihood(
     coefficients = torch.cat(
         (precision[..., rows, columns] * double, pulled, constant[..., None]), dim=-1
     )
-    share = outcomes.weights[..., None].expand(c, m, len(points)) / len(points)
+    count = drawn.shape[1] // m
+    share = outcomes.weights[..., None].expand(c, m, count) / count
     return monomials @ coefficients.mT, share.flatten(1)
+
+
+def outcome_points(
+    outcomes: Outcomes, noise: Float[Tensor, "p k"] | None = None
+) -> tuple[Float[Tensor, "c n k"], Float[Tensor, "c m k"]]:
+    """The outcomes that are looked at, p of each particle in turn, and the particles' means, all
+    from the mean of the command."""
+    k = outcomes.mean.shape[-1]
+    mean = outcomes.mean - (outcomes.weights[..., None] * outcomes.mean).sum(1, keepdim=True)
+    points = cubature_points(k, mean.dtype).to(mean.device) if noise is None else noise
+    drawn = mean[:, :, None] + torch.einsum("cmij,pj->cmpi", outcomes.factor, points)
+    return drawn.flatten(1, 2), mean
 
 
 def reweight(
@@ -128,10 +100,10 @@ def reweight(
     """Weights after each outcome, and the log of what they were divided by."""
     joint = log_likelihood + weights.log()[:, None]
     # As logsumexp does it, with the exponentials taken once for both.
-    peak = joint.amax(-1, keepdim=True)
-    posterior = joint.sub_(peak).exp_()
-    total = posterior.sum(-1, keepdim=True)
-    return posterior.div_(total), (peak + total.log())[..., 0]
+    peak = joint.detach().amax(-1, keepdim=True)
+    relative = (joint - peak).exp()
+    total = relative.sum(-1, keepdim=True)
+    return relative / total, (peak + total.log())[..., 0]
 
 
 def cubature_points(k: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "p k"]:

@@ -38,18 +38,36 @@ class Outcomes:
     outcome teaches; their part of the covariance is field @ field^T. None: everything that a
     particle does not know is noise."""
 
-    def after(self, first: Outcomes, command: int) -> Outcomes:
-        """The same where the outcome of a command of `first` has taught the particles' fields."""
+    @property
+    def field_share(self) -> Float[Tensor, "c m k j"]:
+        """The field in units in which the covariance of the outcome is 1."""
+        assert self.field is not None
+        return torch.linalg.solve_triangular(self.factor, self.field, upper=False)
+
+    def after(self, first: Outcomes, command: int, outcome: Float[Tensor, " k"]) -> Outcomes:
+        """The same where the outcome of a command of `first` has told of the particles' fields.
+
+        Their numbers are standard normal again: what they are now known to be moves the means.
+        """
         if self.field is None or first.field is None:
             return self
-        taught = torch.linalg.solve_triangular(
-            first.factor[command], first.field[command], upper=False
-        )
+        taught = first.field_share[command]
+        off = (outcome - first.mean[command])[..., None]
+        known = taught.mT @ torch.linalg.solve_triangular(first.factor[command], off, upper=False)
         gram = taught.mT @ taught
-        one = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-        left = torch.linalg.cholesky((1.0 + LEAST_NOISE) * one - gram)
-        covariance = self.factor @ self.factor.mT - self.field @ gram @ self.field.mT
-        return replace(self, factor=torch.linalg.cholesky(covariance), field=self.field @ left)
+        rest = root_of_rest(self.field_share @ gram @ self.field_share.mT)
+        return replace(
+            self,
+            mean=self.mean + (self.field @ known)[..., 0],
+            factor=self.factor @ rest,
+            field=self.field @ root_of_rest(gram),
+        )
+
+
+def root_of_rest(share: Float[Tensor, "*batch k k"]) -> Float[Tensor, "*batch k k"]:
+    """Cholesky factor of what a share of the unit covariance leaves of it, in double precision."""
+    one = torch.eye(share.shape[-1], dtype=share.dtype, device=share.device)
+    return torch.linalg.cholesky((1.0 + LEAST_NOISE) * one - share)
 
 
 def belief_outcomes(

@@ -20,7 +20,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.information import belief_outcomes, expected_information_gain, expected_variance
+from tpcd.information import (
+    belief_outcomes,
+    expected_information_gain,
+    expected_variance,
+    present_variance,
+)
 from tpcd.policies.basic import best_within, within
 from tpcd.policies.limits import Limits
 from tpcd.policies.lookahead import second_step_gain
@@ -191,11 +196,8 @@ class ActivePolicy:
         if self._task is None:
             return expected_information_gain(outcomes) / away**self._settings.stride_cost, excess
         values, field = self._task.answers(predictor)
-        weights = predictor.weights[:, None]
-        now = (weights * (values - (weights * values).sum(0)).square()).sum(0).mean()
-        if field is not None:
-            now = now + (weights * field.square().sum(-1)).sum(0).mean()
-        fall = now - expected_variance(outcomes, values, torch.ones_like(values[0]), field)
+        now = present_variance(outcomes.weights, values, field)
+        fall = now - expected_variance(outcomes, values, field)
         return fall / away**self._settings.stride_cost, excess
 
 

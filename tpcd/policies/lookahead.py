@@ -1,6 +1,6 @@
 """Look-ahead: what a command is worth together with the best one after it.
 
-For each command some outcomes are drawn from the belief. Each gives new weights, less to learn
+For each command some outcomes are drawn from the belief. Each gives new weights, tells something
 of the outline's field, and a new pose, from which goals within reach are rated again; the best
 of them is what the second step adds. One more step of the search is one factor of cost, so this
 is an option and not the default.
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tpcd.belief.resampling import systematic_resample
 from tpcd.information import Outcomes, belief_outcomes, expected_information_gain
-from tpcd.information.gain import pair_log_likelihood, reweight
+from tpcd.information.gain import outcome_points, pair_log_likelihood, reweight
 from tpcd.predict import ContactPredictor
 
 Reach = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -43,6 +43,8 @@ def second_step_gain(
     log_likelihood, _ = pair_log_likelihood(outcomes)
     posterior, _ = reweight(log_likelihood, outcomes.weights)
     noise = posterior.shape[1] // posterior.shape[2]
+    centre = (outcomes.weights[..., None] * outcomes.mean).sum(1, keepdim=True)
+    told = outcome_points(outcomes)[0] + centre
     values = []
     for c, command in enumerate(commands):
         best = []
@@ -53,11 +55,11 @@ def second_step_gain(
             found, _ = belief_outcomes(
                 predictor, pose, low + (high - low) * place, command, sensor_std
             )
-            after = posterior[c, int(particle) * noise + s % noise]
-            weights = (found.weights > 0) * after
+            row = int(particle) * noise + s % noise
+            weights = (found.weights > 0) * posterior[c, row]
             total = weights.sum(-1, keepdim=True)
             weights = torch.where(total > 0, weights / total, found.weights)
-            found = replace(found, weights=weights).after(outcomes, c)
+            found = replace(found, weights=weights).after(outcomes, c, told[c, row])
             best.append(expected_information_gain(found).max())
         values.append(torch.stack(best).mean())
     return torch.stack(values)

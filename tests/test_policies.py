@@ -25,7 +25,7 @@ from tpcd.policies import (
 )
 from tpcd.policies.active import Task
 from tpcd.policies.basic import best_within
-from tpcd.policies.lookahead import second_step_gain
+from tpcd.policies.lookahead import Reach, second_step_gain
 from tpcd.predict import ContactPredictor
 from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
@@ -278,26 +278,29 @@ def known_but_fields(belief: Belief, variance: Tensor) -> Belief:
     return replace(known, vectors=vectors, misfit_covariance=covariance)
 
 
+def two_gains(
+    belief: Belief, particles: int, start: Episode, commands: Tensor, reach: Reach
+) -> tuple[Tensor, Tensor]:
+    """What each command teaches, and the best one within reach after it."""
+    predictor = ContactPredictor(belief, particles)
+    std = start.sensor_std
+    outcomes, _ = belief_outcomes(predictor, start.poses[0], commands, start.commands[0], std)
+    generator = torch.Generator().manual_seed(0)
+    second = second_step_gain(predictor, outcomes, commands, std, reach, generator)
+    return expected_information_gain(outcomes), second
+
+
 def test_looking_ahead_a_reading_teaches_less_of_the_outline_once_more(
     belief: Belief, episode: Episode
 ) -> None:
     """The first press, and the second after a press and after a move in free space."""
     size = belief.misfit_covariance.shape[-1]
-    predictor = ContactPredictor(known_but_fields(belief, torch.full((size,), 4e-7)), 30)
+    open_ = known_but_fields(belief, torch.full((size,), 4e-7))
     start = row_at(episode, (0.0, 0.15, 0.0))
     press, free = (0.0, -0.05, 0.0), (0.0, 0.16, 0.0)
     commands = torch.tensor([press, free], dtype=torch.float64)
-    outcomes, _ = belief_outcomes(
-        predictor, start.poses[0], commands, start.commands[0], episode.sensor_std
-    )
-    first = expected_information_gain(outcomes)
-    again, anew = second_step_gain(
-        predictor,
-        outcomes,
-        commands,
-        episode.sensor_std,
-        lambda _: (commands[0], commands[0]),
-        torch.Generator().manual_seed(0),
+    first, (again, anew) = two_gains(
+        open_, 30, start, commands, lambda _: (commands[0], commands[0])
     )
     assert first[0] > 0.8 and first[1] < 1e-6
     assert float(anew) == pytest.approx(float(first[0]), rel=0.05)
@@ -362,22 +365,10 @@ def test_the_grid_policy_stays_near_the_basic_trajectory(belief: Belief, episode
 def test_looking_ahead_counts_what_is_left_to_learn(belief: Belief, episode: Episode) -> None:
     """After a command that tells the floor nothing is left; after one in free space, all is."""
     known = known_but(belief, "floor_height")
-    predictor = ContactPredictor(known, 60)
     start = row_at(episode, (0.0, 0.15, 0.0))
     tells, free = (0.0, -0.05, 0.0), (0.0, 0.16, 0.0)
     commands = torch.tensor([tells, free], dtype=torch.float64)
-    outcomes, _ = belief_outcomes(
-        predictor, start.poses[0], commands, start.commands[0], episode.sensor_std
-    )
-    first = expected_information_gain(outcomes)
-    second = second_step_gain(
-        predictor,
-        outcomes,
-        commands,
-        episode.sensor_std,
-        lambda pose: (pose - 0.2, pose + 0.2),
-        torch.Generator().manual_seed(0),
-    )
+    first, second = two_gains(known, 60, start, commands, lambda pose: (pose - 0.2, pose + 0.2))
     assert first[1] < 0.01 and first[0] > 2
     assert second[1] > 0.8 * first[0]
     # What two readings of the floor tell more than one.

@@ -7,8 +7,7 @@ with that and with all of them, over the number of particles and the number of c
 a choice of our own policy. The ranking is tested on beliefs met while exploring, the prior
 included: goals near and far are ranked by the estimator with few particles, and by a reference
 with all of them and many draws of the noise (the part that is of the outline's misfit is a closed
-form in both). Regret is the gain that taking the estimator's best
-loses.
+form in both). Regret is the gain that taking the estimator's best loses.
 """
 
 from __future__ import annotations

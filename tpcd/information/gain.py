@@ -51,8 +51,9 @@ def field_gain(outcomes: Outcomes) -> Float[Tensor, " c"]:
     """Information [nat] that each command is expected to bring of the particles' fields."""
     if outcomes.field is None:
         return outcomes.weights.new_zeros(len(outcomes.weights))
+    share = outcomes.field_share
     # Of the noise, in units in which the covariance of the outcome is 1.
-    noise = root_of_rest(outcomes.field_share @ outcomes.field_share.mT)
+    noise = root_of_rest(share @ share.mT)
     each = -noise.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return (outcomes.weights * each).sum(-1).clamp_min(0.0)
 

@@ -55,7 +55,8 @@ class Outcomes:
         off = (outcome - first.mean[command])[..., None]
         known = taught.mT @ torch.linalg.solve_triangular(first.factor[command], off, upper=False)
         gram = taught.mT @ taught
-        rest = root_of_rest(self.field_share @ gram @ self.field_share.mT)
+        share = self.field_share
+        rest = root_of_rest(share @ gram @ share.mT)
         return replace(
             self,
             mean=self.mean + (self.field @ known)[..., 0],

@@ -10,9 +10,10 @@ drawn at random: permuting particles, or splitting one into two of half its weig
 nothing. With m particles it does not exceed log m. Everything is in the log domain.
 
 What a particle leaves open, the field along the outline, is learnt by Kalman's formulas once the
-particle is given. By the chain rule of information what an outcome tells of both is what it tells
-of the particle, and in the mean over particles what it tells of the field of each: of two normal
-distributions, half the logarithm of the ratio of determinants with the field and without.
+particle is given. By the chain rule of information (Cover and Thomas 2006, section 2.5) what an
+outcome tells of both is what it tells of the particle, and in the mean over particles what it tells
+of the field of each: half the logarithm of the ratio of the determinants of the outcome's
+covariance with the field and without.
 
 Axes: c commands, m particles, n outcomes that are looked at, k channels, j numbers of a field.
 """

@@ -70,12 +70,11 @@ def _after(
 ) -> tuple[Float[Tensor, "c m a v"], Float[Tensor, "#c m"]]:
     """What each particle says after an outcome y, as factors of 1 and, where it learns of its
     field, of the k channels of y (a is 1 or 1 + k); and the mean variance that its field leaves."""
-    c = len(outcomes.mean)
-    if field is None:
-        return values.expand(c, 1, *values.shape).transpose(1, 2), values.new_zeros(1, len(values))
-    present = field.square().sum(-1).mean(-1)[None]
-    if outcomes.field is None:
-        return values.expand(c, 1, *values.shape).transpose(1, 2), present
+    present = values.new_zeros(1, len(values))
+    if field is not None:
+        present = field.square().sum(-1).mean(-1)[None]
+    if field is None or outcomes.field is None:
+        return values[:, None].expand(len(outcomes.mean), -1, -1, -1), present
     taught = outcomes.field_share @ field.mT
     slope = torch.linalg.solve_triangular(outcomes.factor.mT, taught, upper=True)
     _, mean = outcome_points(outcomes)

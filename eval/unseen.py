@@ -120,16 +120,16 @@ def evaluate_unseen(config: Unseen) -> None:
             cell = _cell(config, name, outlines[name].vertices, prior, seed)
             write_line(lines, cell)
             cells.append(cell)
-    columns = [key for key in cells[0] if key not in ("transform", "theta_score")]
+    columns = [key for key in cells[0] if key not in ("contact_transform", "theta_score")]
     table = [{key: cell[key] for key in columns} for cell in cells]
     means = _means(table, priors)
     print(format_table([*table, *means]))
     transforms = {
-        p: [row for c in cells if c["prior"] == p for row in c["transform"]] for p in priors
+        p: [row for c in cells if c["prior"] == p for row in c["contact_transform"]] for p in priors
     }
     with SummaryWriter(folder / "tensorboard") as writer:
         for prior, rows in transforms.items():
-            figure = calibration(_array(rows), CHANNELS)
+            figure = calibration(_array(rows), CHANNELS, "rows in contact")
             save_figure(figure, folder / "figures", f"calibration-{prior}", writer)
         labels = {"x_mm": "error of x [mm]", "z_mm": "error of z [mm]", "F_z_N": "error of F_z [N]"}
         figure = error_bars(table, labels, group="prior", targets=TARGETS)
@@ -203,7 +203,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     row["s_per_step"] = seconds / config.steps
     row["s_closing"] = 0.0 if closing is None else closed.seconds
     row["ess"] = closed.info.effective_sample_size
-    row["transform"] = transform.tolist()
+    row["contact_transform"] = transform[touching].tolist()
     row["theta_score"] = score.tolist()
     return row
 

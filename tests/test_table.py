@@ -27,7 +27,8 @@ def cell(name: str, seed: int, policy: str, error: float) -> Row:
         "truth": "mujoco", "object": name, "seed": seed, "estimator": "default", "policy": policy,
         "moves": [1, 2], "mae": [[10 * error] * 6, [error] * 6], "sd": [[0.0] * 6, [error] * 6],
         "peak_wrench": [10 * error] * 3, "coverage_50": [0.1, 0.5], "coverage_90": [0.2, 0.9],
-        "contact_90": [0.3, 0.8], "choosing_s": 1.0, "learning_s": 2.0, "transform": [[0.5] * 6],
+        "contact_90": [0.3, 0.8], "choosing_s": 1.0, "learning_s": 2.0,
+        "contact_transform": [[0.5] * 6],
         "open_mae": [[10 * error] * 6, [2 * error] * 6], "closing_s": 3.0,
     }  # fmt: skip
 

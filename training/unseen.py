@@ -57,10 +57,12 @@ def measure_unseen(
     alone = {n: best_fit(shape, v, generator, scene=False) for n, v in outlines.items()}
     hull = {n: root_mean_square(f.hull_errors_mm) for n, f in with_scene.items()}
     sizes = np.array(list(hull.values()))
+    unseen = [np.stack((fit.hull_errors_mm, fit.hull_slopes_mm)) for fit in with_scene.values()]
     known = [
-        MM * (support_of(_decoded(shape, n), HULL_DIRECTIONS) - support_of(v, HULL_DIRECTIONS))[0]
+        MM * (support_of(_decoded(shape, n), HULL_DIRECTIONS) - support_of(v, HULL_DIRECTIONS))
         for n, v in trained.items()
     ]
+    report = measure_misfit(unseen, known, seed)
     figures: dict[str, object] = {
         "outlines": len(outlines),
         "best_fit_mm": vars(Spread.of(_pooled(with_scene))),
@@ -72,8 +74,9 @@ def measure_unseen(
             name: round(float(fit.errors_mm.mean()), 3) for name, fit in with_scene.items()
         },
         "fitted": "latent, scale in [0.8, 1.2], mount within 20 mm and 0.2 rad",
+        "misfit_within_intervals": report.held,
     }
-    return UnseenReport(figures, measure_misfit(list(with_scene.values()), known))
+    return UnseenReport(figures, report.misfit)
 
 
 def _decoded(shape: DeepSDFShape, name: str) -> Float64[np.ndarray, "p 2"]:

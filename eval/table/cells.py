@@ -98,7 +98,7 @@ def run_cell(
                 row["closing_s"] = learnt[-1].seconds
                 found = _test(learnt[-1].belief, recordings)
             for name, value in found.items():
-                row[name] = value if name == "transform" else [*row[name], value]
+                row[name] = value if name == "contact_transform" else [*row[name], value]
         if moves == steps:
             break
     true = torch.cat([test.true.wrenches[1:] for test in recordings])
@@ -128,7 +128,7 @@ def _test(belief: Belief, recordings: tuple[Recording, ...]) -> dict[str, Any]:
         "coverage_50": _covered(transform, 0.5),
         "coverage_90": _covered(transform, 0.9),
         "contact_90": _covered(transform[touching], 0.9),
-        "transform": [[round(value, 4) for value in one] for one in transform.tolist()],
+        "contact_transform": [[round(v, 4) for v in one] for one in transform[touching].tolist()],
     }
 
 

@@ -64,9 +64,10 @@ def draw_summary(cells: Sequence[Row], folder: Path, writer: ImageWriter) -> Non
             figure = error_bars(bars, labels, group="row")
             save_figure(figure, folder, f"{truth}-objects", writer)
         for kind in dict.fromkeys(label(row) for row in chosen):
-            rows = [one for row in chosen if label(row) == kind for one in row["transform"]]
+            rows = [one for row in chosen if label(row) == kind for one in row["contact_transform"]]
             name = f"{truth}-calibration-{kind.replace(' / ', '-')}"
-            save_figure(calibration(np.array(rows), CHANNELS), folder, name, writer)
+            figure = calibration(np.array(rows), CHANNELS, "rows in contact")
+            save_figure(figure, folder, name, writer)
     for line in summarise(cells):
         for key in ("x_mm", "z_mm", "F_x_N", "F_z_N", "tau_Nm", "coverage_90"):
             tag = f"{line['truth']}/{key}/{line['row'].replace(' / ', '-')}"

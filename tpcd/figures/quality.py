@@ -16,14 +16,18 @@ from tpcd.figures.style import SERIES, TRUTH, Array, LegendKey, legend_below, pa
 
 
 def calibration(
-    probability_transform: Float[Array, "n c"], names: Sequence[str], samples: int | None = None
+    probability_transform: Float[Array, "n c"],
+    names: Sequence[str],
+    values: str = "rows",
+    samples: int | None = None,
 ) -> Figure:
     """Draw observed against nominal coverage of central intervals for c channels.
 
     `probability_transform` holds F(y), the predicted distribution function at each of the
     n observed values, in [0, 1]; it is uniform where predictions are calibrated. The grey
     band holds 90 % of the curves of a calibrated prediction from `samples` independent
-    values (default n). Raises `ValueError` when the number of names is not c.
+    values (default n). `values` says what the n are. Raises `ValueError` when the number of names
+    is not c.
     """
     transform = np.asarray(probability_transform, dtype=float)
     if len(names) != transform.shape[1]:
@@ -49,7 +53,7 @@ def calibration(
     panel.set_aspect("equal")
     panel.set_xlabel("nominal level of the interval [%]")
     panel.set_ylabel("values observed inside [%]")
-    title(panel, f"below: too sure; above: not enough (n = {count})")
+    title(panel, f"below: too sure; above: not enough ({count} {values})")
     legend_below(figure, entries | {"calibrated": ideal, "90 % by chance": band}, columns=2)
     return figure
 

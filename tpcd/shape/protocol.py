@@ -32,11 +32,11 @@ class Misfit:
     outline is exact."""
     spread: float = 1.0
     """Standard deviation of the logarithm of that standard deviation, by outline."""
-    width: float = 0.137
+    width: float = 0.159
     """Between two angles that has the correlation exp(-(a - b)^2 / (4 width^2)) [rad]."""
-    grain: float = 0.1
+    grain: float = 0.059
     """Standard deviation of what is not smooth, as a share of `sd`."""
-    roughness: float = 9.4
+    roughness: float = 2.76
     """The same of its slope [1/rad], by which contact is elsewhere along the terrain."""
 
     def __post_init__(self) -> None:

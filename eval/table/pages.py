@@ -61,7 +61,8 @@ def draw_summary(cells: Sequence[Row], folder: Path, writer: ImageWriter) -> Non
         if ours:
             bars = [_bar(ours, name, kind) for name, kind in _places(ours)]
             labels = {"xz_mm": "error of x and z [mm]", "F_N": "error of force [N]"}
-            figure = error_bars(bars, labels, group="row")
+            colours = {label(row): _colour(row["policy"]) for row in ours}
+            figure = error_bars(bars, labels, group="row", colours=colours)
             save_figure(figure, folder, f"{truth}-objects", writer)
         for kind in dict.fromkeys(label(row) for row in chosen):
             rows = [one for row in chosen if label(row) == kind for one in row["contact_transform"]]
@@ -79,8 +80,10 @@ def _curve_figure(cells: Sequence[Row], truth: str) -> Any:
     entries = {}
     for name, (moves, errors) in curves(cells, truth).items():
         estimator, policy = name.split(" / ")
-        style, colour = "--" if estimator == "paper" else "-", SERIES[POLICIES.index(policy)]
-        (entries[name],) = panel.plot(moves, errors, style, color=colour, marker=".", linewidth=1.6)
+        style = "--" if estimator == "paper" else "-"
+        (entries[name],) = panel.plot(
+            moves, errors, style, color=_colour(policy), marker=".", linewidth=1.6
+        )
     entries["what the paper reports, 15 moves"] = panel.axhline(
         PAPER_ERROR, color="0.5", linestyle=":"
     )
@@ -89,6 +92,10 @@ def _curve_figure(cells: Sequence[Row], truth: str) -> Any:
     panel.set_ylabel("mean error of x and z [mm]")
     legend_below(figure, entries, columns=3)
     return figure
+
+
+def _colour(policy: str) -> str:
+    return SERIES[POLICIES.index(policy)]
 
 
 def _places(rows: Sequence[Row]) -> list[tuple[str, str]]:

@@ -87,13 +87,15 @@ def error_bars(
     label: str = "object",
     group: str | None = None,
     targets: Mapping[str, float] | None = None,
+    colours: Mapping[str, str] | None = None,
 ) -> Figure:
     """Draw errors of many objects as horizontal bars, one panel for each kind of error.
 
     `table` has one mapping for each object; `values` maps its columns to axis labels with
     units (`{"x_mm": "error of x [mm]"}`); `label` names the column with the object's name,
     `group` one that tells bars apart by colour (the prior); `targets` adds a line for a
-    column. Objects are ordered by the first column. Missing values leave a gap.
+    column; `colours` may give the groups colours of their own. Objects are ordered by the first
+    column. Missing values leave a gap.
     """
     if not table or not values:
         raise ValueError("nothing to draw: the table or the choice of columns is empty")
@@ -120,9 +122,9 @@ def error_bars(
             }
             lengths = np.array([chosen.get(entry) for entry in objects], dtype=float)
             offset = (i - (len(groups) - 1) / 2) * height
-            entries[name] = panel.barh(
-                np.arange(len(objects)) - offset, lengths, 0.9 * height, color=SERIES[i % 6]
-            )
+            colour = colours[name] if colours else SERIES[i % 6]
+            places = np.arange(len(objects)) - offset
+            entries[name] = panel.barh(places, lengths, 0.9 * height, color=colour)
         if targets and key in targets:
             panel.axvline(targets[key], color=TRUTH, linestyle="--", linewidth=1.2)
             entries["target"] = Line2D([], [], color=TRUTH, linestyle="--", linewidth=1.2)

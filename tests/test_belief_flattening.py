@@ -169,17 +169,20 @@ def test_rows_that_points_contradict_are_left_out(
     episodes: list[tuple[Tensor, ContactTarget]],
 ) -> None:
     """A slide that is taken for rolling says that the floor is elsewhere."""
-    truth, target = next(each for each in episodes if slides_and_turns(each[1].history))
-    history = target.history
-    assert history is not None
-    touched = torch.zeros(len(history), 2, dtype=torch.bool)
-    touched[:, 0] = True
-    wrong = flattening(target.prior, target.misfit, history, touched, touched)
     one = torch.ones(1, dtype=torch.float64)
-    six = target.prior.to_vector(truth[:, :-1])[:, wrong.entries]
-    off = (six @ wrong.rows.mT - wrong.values)[0].abs()
+    for truth, target in episodes:
+        history = target.history
+        assert history is not None
+        touched = torch.zeros(len(history), 2, dtype=torch.bool)
+        touched[:, 0] = True
+        wrong = flattening(target.prior, target.misfit, history, touched, touched)
+        six = target.prior.to_vector(truth[:, :-1])[:, wrong.entries]
+        off = (six @ wrong.rows.mT - wrong.values)[0].abs()
+        if slides_and_turns(history) and float(off.max()) > 5:
+            break
+    else:
+        pytest.fail("no episode contradicts that all slides are rolling")
     kept = wrong.consistent(truth, one)
-    assert float(off.max()) > 5
     assert len(kept.rows) == int((off < 3).sum()) < len(wrong.rows)
 
 
@@ -200,8 +203,7 @@ def test_touches_that_points_contradict_are_left_out(
     torch.testing.assert_close(kept.poses, right.poses)
 
 
-def slides_and_turns(history: History | None) -> bool:
-    assert history is not None
+def slides_and_turns(history: History) -> bool:
     turn = (history.settled - history.start)[:, 2].abs() > 0.1
     moved = (history.settled - history.start)[:, 0].abs() > 0.02
     return bool((turn & moved)[1:].any())

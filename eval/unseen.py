@@ -94,17 +94,20 @@ def evaluate_unseen(config: Unseen) -> None:
     from torch.utils.tensorboard import SummaryWriter
     from tqdm import tqdm
 
+    from eval.objects import main_outlines
     from tpcd.figures.quality import calibration, error_bars
     from tpcd.figures.sinks import save_figure
     from tpcd.prediction import CHANNELS
     from tpcd.results import continue_run, format_table, open_run, write_results
-    from tpcd.shape.ycb import load_ycb
+    from tpcd.shape.checkpoint import find_prior
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
-    outlines = load_ycb("main")
+    outlines = main_outlines(config.objects)
     names = config.objects or (QUICK if config.quick else (*SEEN, *UNSEEN))
     priors = config.priors[:1] if config.quick else config.priors
+    for prior in priors:
+        find_prior(prior)
     if config.resume:
         folder = continue_run(config.out, config, free=("out",))
     else:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from eval.unseen import SEEN, UNSEEN, Unseen, evaluate_unseen
-from tpcd.errors import FileError
+from tpcd.errors import CheckpointError, FileError
 from tpcd.shape.ycb import GRASPABLE_21, ycb_folder
 
 SMALL = Unseen(
@@ -48,3 +48,19 @@ def test_a_run_scores_every_cell_and_goes_on_after_a_stop(tmp_path: Path) -> Non
     evaluate_unseen(replace(SMALL, out=out, resume=True))
     again = json.loads((out / "results.json").read_text())
     assert again["table"] == results["table"]
+
+
+@pytest.mark.skipif(ycb_folder() is None, reason="needs the YCB meshes")
+@pytest.mark.parametrize(
+    ("asked", "error", "told"),
+    [
+        ({"objects": ("teapot",)}, ValueError, "object is 'teapot', expected one of 001_chips_can"),
+        ({"priors": ("teapots",)}, CheckpointError, "teapots: holds no prior"),
+    ],
+)
+def test_what_is_not_there_is_refused_before_anything_is_written(
+    asked: dict[str, tuple[str, ...]], error: type[Exception], told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=told):
+        evaluate_unseen(replace(SMALL, out=tmp_path / "run", **asked))
+    assert not (tmp_path / "run").exists()

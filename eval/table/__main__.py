@@ -112,14 +112,11 @@ def make_table(config: Table) -> None:
     from lightning.fabric import Fabric
     from lightning.fabric.strategies.ddp import DDPStrategy
 
+    from eval.objects import main_outlines
     from tpcd.results import continue_run, open_run
-    from tpcd.shape.ycb import load_ycb
 
     torch.set_num_threads(1)
-    known = load_ycb("main")
-    for name in config.objects:
-        if name not in known:
-            raise ValueError(f"object is {name!r}, expected one of {', '.join(sorted(known))}")
+    main_outlines(config.objects)
     # Before there are other processes, so that a folder in use is one line and not a crash.
     if int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))) == 0:
         if config.resume:

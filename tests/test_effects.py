@@ -80,19 +80,20 @@ def test_null_values_change_no_bit(
     without: dict[bool, HistoryLikelihood],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    count = 6 if compiled else 3
     if not compiled:  # Slow: three transitions, onto the floor, turning there, and to the wall.
         monkeypatch.setattr(native, "available", lambda: False)
         history = history.using(torch.isin(torch.arange(len(history)), torch.tensor([1, 3, 7])))
     shape = PolygonShape(builtin_outlines()["mug"])
     prior = make_prior(shape)
-    draws = prior.to_vector(prior.sample(6, torch.Generator().manual_seed(1)))
+    draws = prior.to_vector(prior.sample(count, torch.Generator().manual_seed(1)))
     null = torch.tensor([[p.null for p in effect.parameters]], dtype=torch.float64)
-    field, sd = MisfitField(5e-4), torch.full((6,), 5e-4, dtype=torch.float64)
+    field, sd = MisfitField(5e-4), torch.full((count,), 5e-4, dtype=torch.float64)
     arguments = (shape, Parameters.from_vector(draws), sd, history, field, StepSettings())
     if compiled not in without:
         without[compiled] = history_likelihood(*arguments)
     base = without[compiled]
-    found = history_likelihood(*arguments, added=Added((effect,), null.expand(6, -1)))
+    found = history_likelihood(*arguments, added=Added((effect,), null.expand(count, -1)))
     assert torch.equal(found.total, base.total)
     assert torch.equal(found.field_mean, base.field_mean)
 

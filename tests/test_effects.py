@@ -65,37 +65,57 @@ def history() -> History:
     return history_of(record(truth, scene, motion, 8, generator).measured)
 
 
-@pytest.fixture(scope="module")
-def without() -> dict[bool, HistoryLikelihood]:
-    """Likelihoods without effects, by compiled loops or not, kept for all effects."""
-    return {}
-
-
-@pytest.mark.parametrize("effect", KNOWN, ids=lambda effect: effect.name)
-@pytest.mark.parametrize("compiled", [True, False])
-def test_null_values_change_no_bit(
-    effect: Effect,
-    compiled: bool,
-    history: History,
-    without: dict[bool, HistoryLikelihood],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    count = 6 if compiled else 3
-    if not compiled:  # Slow: three transitions, onto the floor, turning there, and to the wall.
-        monkeypatch.setattr(native, "available", lambda: False)
-        history = history.using(torch.isin(torch.arange(len(history)), torch.tensor([1, 3, 7])))
+def likelihood_with(history: History, count: int, effects: tuple[Effect, ...]) -> HistoryLikelihood:
+    """The likelihood at `count` draws of theta with these effects at their null values."""
     shape = PolygonShape(builtin_outlines()["mug"])
     prior = make_prior(shape)
     draws = prior.to_vector(prior.sample(count, torch.Generator().manual_seed(1)))
-    null = torch.tensor([[p.null for p in effect.parameters]], dtype=torch.float64)
     field, sd = MisfitField(5e-4), torch.full((count,), 5e-4, dtype=torch.float64)
-    arguments = (shape, Parameters.from_vector(draws), sd, history, field, StepSettings())
-    if compiled not in without:
-        without[compiled] = history_likelihood(*arguments)
-    base = without[compiled]
-    found = history_likelihood(*arguments, added=Added((effect,), null.expand(count, -1)))
-    assert torch.equal(found.total, base.total)
-    assert torch.equal(found.field_mean, base.field_mean)
+    nulls = [parameter.null for effect in effects for parameter in effect.parameters]
+    null = torch.tensor([nulls], dtype=torch.float64).expand(count, -1)
+    return history_likelihood(
+        shape,
+        Parameters.from_vector(draws),
+        sd,
+        history,
+        field,
+        StepSettings(),
+        **({"added": Added(effects, null)} if effects else {}),
+    )
+
+
+@pytest.fixture(scope="module")
+def without(history: History) -> HistoryLikelihood:
+    """The likelihood without effects, by compiled loops."""
+    return likelihood_with(history, 6, ())
+
+
+@pytest.mark.parametrize("effect", KNOWN, ids=lambda effect: effect.name)
+def test_null_values_change_no_bit(
+    effect: Effect, history: History, without: HistoryLikelihood
+) -> None:
+    found = likelihood_with(history, 6, (effect,))
+    assert torch.equal(found.total, without.total)
+    assert torch.equal(found.field_mean, without.field_mean)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        KNOWN,
+        *(pytest.param((effect,), marks=pytest.mark.slow, id=effect.name) for effect in KNOWN),
+    ],
+    ids=lambda effects: "all at once",
+)
+def test_null_values_change_no_bit_in_the_torch_engine(
+    effects: tuple[Effect, ...], history: History, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is slow, so for three transitions: onto the floor, turning there, and to the wall."""
+    monkeypatch.setattr(native, "available", lambda: False)
+    history = history.using(torch.isin(torch.arange(len(history)), torch.tensor([1, 3, 7])))
+    without, found = (likelihood_with(history, 3, some) for some in ((), effects))
+    assert torch.equal(found.total, without.total)
+    assert torch.equal(found.field_mean, without.field_mean)
 
 
 def test_without_effects_the_truth_is_the_quasistatic_one() -> None:

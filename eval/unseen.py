@@ -105,9 +105,11 @@ def evaluate_unseen(config: Unseen) -> None:
     torch.set_num_threads(1)
     outlines = main_outlines(config.objects)
     names = config.objects or (QUICK if config.quick else (*SEEN, *UNSEEN))
-    priors = config.priors[:1] if config.quick else config.priors
-    for prior in priors:
-        find_prior(prior)
+    given = config.priors[:1] if config.quick else config.priors
+    # By the names of their folders, which name figures too.
+    priors = {find_prior(prior).resolve().name: prior for prior in given}
+    if len(priors) < len(given):
+        raise ValueError(f"priors are {', '.join(given)}, expected priors of different names")
     if config.resume:
         folder = continue_run(config.out, config, free=("out",))
     else:
@@ -120,12 +122,12 @@ def evaluate_unseen(config: Unseen) -> None:
         for name, prior, seed in tqdm(plan, unit="cell", initial=0):
             if (name, prior, seed) in done:
                 continue
-            cell = _cell(config, name, outlines[name].vertices, prior, seed)
+            cell = _cell(config, name, outlines[name].vertices, priors[prior], seed)
             write_line(lines, cell)
             cells.append(cell)
     columns = [key for key in cells[0] if key not in ("contact_transform", "theta_score")]
     table = [{key: cell[key] for key in columns} for cell in cells]
-    means = _means(table, priors)
+    means = _means(table, list(priors))
     print(format_table([*table, *means]))
     transforms = {
         p: [row for c in cells if c["prior"] == p for row in c["contact_transform"]] for p in priors
@@ -159,7 +161,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     from tpcd.exploration import Estimator
     from tpcd.predict import ContactPredictor
     from tpcd.prediction import CHANNELS
-    from tpcd.shape.checkpoint import load_prior
+    from tpcd.shape.checkpoint import find_prior, load_prior
     from tpcd.truth.recording import make_motion, record
     from tpcd.truth.scene import draw_scene, make_truth
 
@@ -192,7 +194,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     score = (belief.mean()[z:] - truth_vector) / belief.std()[z:]
     row: dict[str, Any] = {
         "object": name,
-        "prior": prior,
+        "prior": find_prior(prior).resolve().name,
         "seen": name in SEEN,
         "seed": seed,
     }
@@ -211,7 +213,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     return row
 
 
-def _means(table: list[dict[str, Any]], priors: tuple[str, ...]) -> list[dict[str, Any]]:
+def _means(table: list[dict[str, Any]], priors: list[str]) -> list[dict[str, Any]]:
     """Means over objects for each prior, seen and unseen apart and together."""
     means = []
     for prior in priors:

@@ -12,8 +12,9 @@ from eval.unseen import SEEN, UNSEEN, Unseen, evaluate_unseen
 from tpcd.errors import CheckpointError, FileError
 from tpcd.shape.ycb import GRASPABLE_21, ycb_folder
 
+PRIOR = Path(__file__).parents[1] / "checkpoints" / "ycb21-z2"
 SMALL = Unseen(
-    priors=("ycb21-z2",),
+    priors=(str(PRIOR),),
     objects=("006_mustard_bottle",),
     steps=5,
     tests=1,
@@ -42,7 +43,9 @@ def test_a_run_scores_every_cell_and_goes_on_after_a_stop(tmp_path: Path) -> Non
     assert 0 < cell["x_mm"] < 10 and 0 < cell["F_z_N"] < 1
     assert 0 <= cell["coverage_90"] <= 1
     assert results["table"][-1]["object"].startswith("MEAN")
+    assert cell["prior"] == "ycb21-z2"
     assert (out / "figures" / "errors.png").is_file()
+    assert (out / "figures" / "calibration-ycb21-z2.png").is_file()
     first = (out / "cells.jsonl").read_text()
     (out / "cells.jsonl").write_text(first + '{"object": "cut off')
     evaluate_unseen(replace(SMALL, out=out, resume=True))
@@ -55,6 +58,7 @@ def test_a_run_scores_every_cell_and_goes_on_after_a_stop(tmp_path: Path) -> Non
     [
         ({"objects": ("teapot",)}, ValueError, "object is 'teapot', expected one of 001_chips_can"),
         ({"priors": ("teapots",)}, CheckpointError, "teapots: holds no prior"),
+        ({"priors": ("ycb21-z2", str(PRIOR))}, ValueError, "expected priors of different names"),
     ],
 )
 def test_what_is_not_there_is_refused_before_anything_is_written(

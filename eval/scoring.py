@@ -8,12 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.commands.prediction import measured_rows, one_step, prediction_error
+from tpcd.commands.prediction import in_contact, measured_rows, one_step, prediction_error
 from tpcd.predict import ContactPredictor
 from tpcd.truth.recording import Recording
-
-LEAST_LOAD = 1e-3
-"""Wrench from which a row counts as contact [N, N·m]."""
 
 
 def score_tests(
@@ -29,5 +26,5 @@ def score_tests(
         predicted, rows = one_step(predictor, test.measured, "true"), measured_rows(test.true)[1:]
         errors.append(prediction_error(rows, predicted.mean))
         transforms.append(predicted.probability_below(rows))
-    touching = [test.true.wrenches[1:].abs().amax(-1) > LEAST_LOAD for test in tests]
+    touching = [in_contact(test.true) for test in tests]
     return torch.cat(errors).abs(), torch.cat(transforms), torch.cat(touching)

@@ -61,6 +61,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     from tpcd.commands.exploring import EPISODE_NAME
     from tpcd.commands.prediction import (
         PredictedRows,
+        in_contact,
         measured_rows,
         predict_rows,
         score_rows,
@@ -114,7 +115,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     seconds = (time.perf_counter() - started) / config.steps
 
     predictor = ContactPredictor(belief)
-    predicted, true_rows = [], []
+    predicted, true_rows, touching = [], [], []
     with SummaryWriter(folder / "tensorboard") as writer:
         for number in range(config.tests):
             motion = make_motion("test", scene, config.test_steps, generator)
@@ -123,6 +124,7 @@ def explore_and_test(config: Demo, folder: Path) -> None:
             rows = predict_rows(predictor, test.measured, of="true", reference=test.true)
             predicted.append(rows)
             true_rows.append(measured_rows(test.true)[1:])
+            touching.append(in_contact(test.true))
             figure = prediction_figure(
                 true_rows[-1].numpy(),
                 rows.mean.numpy(),
@@ -135,8 +137,10 @@ def explore_and_test(config: Demo, folder: Path) -> None:
         everything = PredictedRows(
             *(torch.cat([getattr(p, name) for p in predicted]) for name in vars(predicted[0]))
         )
-        figure = calibration(everything.transform.numpy(), CHANNELS)
-        save_figure(figure, folder / "figures", "calibration", writer)
+        transform = everything.transform[torch.cat(touching)]
+        if len(transform):
+            figure = calibration(transform.numpy(), CHANNELS, "rows in contact")
+            save_figure(figure, folder / "figures", "calibration", writer)
         table = score_rows(everything, torch.cat(true_rows))
         text = format_table(table)
         writer.add_text("table", f"```\n{text}\n```")

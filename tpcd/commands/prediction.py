@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tpcd.commands.estimation import STEPS_FILE
@@ -30,6 +30,8 @@ from tpcd.results import RESULTS_FILE
 
 CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
 ROLLOUT_SAMPLES = 400
+LEAST_LOAD = 1e-3
+"""Noise-free wrench from which a row counts as contact [N, N·m]."""
 
 
 def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
@@ -123,6 +125,12 @@ def rollout_rows(
 def measured_rows(episode: Episode) -> Float[Tensor, "n 6"]:
     """Pose and wrench of every row side by side."""
     return torch.cat((episode.poses, episode.wrenches), dim=-1)
+
+
+def in_contact(true: Episode) -> Bool[Tensor, " n"]:
+    """Which of rows 1..n of a noise-free episode touch. In free motion the arm reaches its command:
+    such rows are certain, and say nothing of how good an interval is."""
+    return true.wrenches[1:].abs().amax(-1) > LEAST_LOAD
 
 
 def prediction_error(

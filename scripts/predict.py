@@ -47,13 +47,12 @@ def predict_episodes(config: Predict) -> None:
     from tpcd.belief.augmented import with_model
     from tpcd.belief.storage import load_belief
     from tpcd.commands.kept_model import model_of
-    from tpcd.commands.plausibility import check_start_of
+    from tpcd.commands.plausibility import check_start_of, run_warnings
     from tpcd.commands.prediction import (
         PredictedRows,
         measured_rows,
         predict_rows,
         rollout_rows,
-        run_warnings,
         score_rows,
         write_prediction,
     )

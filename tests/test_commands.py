@@ -15,6 +15,7 @@ from command_calls import PRIOR, call, make_world
 
 from tpcd.belief.storage import load_belief
 from tpcd.commands.drawing import central_outline
+from tpcd.commands.unexplained import unexplained_rows, unexplained_warning
 from tpcd.data import read_episode, write_episode
 from tpcd.data.table import read_table
 
@@ -23,6 +24,25 @@ from tpcd.data.table import read_table
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an exploration, a test episode, and the run that learnt from the first."""
     return make_world(tmp_path_factory.mktemp("world"))
+
+
+def test_rows_that_an_estimate_does_not_explain_are_told(world: Path) -> None:
+    belief, episode = load_belief(world / "run"), read_episode(world / "explore.csv")
+    assert unexplained_rows(episode, belief) == []
+    assert json.loads((world / "run" / "summary.json").read_text())["unexplained_rows"] == []
+    # Poses that were not reached; the wrench says otherwise, and the arm obeys it.
+    last = len(episode) - 1
+    poses = episode.poses.clone()
+    poses[last, 1] += 0.01
+    (found,) = unexplained_rows(replace(episode, poses=poses), belief)
+    assert (found["row"], found["channel"]) == (last, "z") and found["deviations"] > 20
+    assert unexplained_warning([found], episode) is None
+    poses[2::2, 1] += 0.01
+    moved = replace(episode, poses=poses)
+    rows = unexplained_rows(moved, belief)
+    assert {row["row"] for row in rows} >= set(range(2, len(episode), 2))
+    told = unexplained_warning(rows, moved)
+    assert told is not None and f"{len(rows)} of {last} rows" in told and "diagnose.py" in told
 
 
 def test_an_estimate_leaves_a_complete_run(world: Path) -> None:

@@ -25,6 +25,7 @@ from tpcd.belief.state import EstimatorState, save_state
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
 from tpcd.commands.summary import prior_summary, summarise
+from tpcd.commands.unexplained import unexplained_rows, unexplained_warning
 from tpcd.data.episode import Episode
 from tpcd.exploration import Closing
 from tpcd.files import write_json, write_text
@@ -137,10 +138,12 @@ class EstimationRun:
         if self.belief is None or self.state is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
         last = self._close(episode) or self.history[-1]
-        write_json(self.folder / "summary.json", summarise(self.belief))
-        warning = few_draws_warning(last)
-        if warning is not None:
-            self.bar.write(warning, file=sys.stderr)
+        unexplained = unexplained_rows(episode, self.belief)
+        summary = {**summarise(self.belief), "unexplained_rows": unexplained}
+        write_json(self.folder / "summary.json", summary)
+        for warning in (few_draws_warning(last), unexplained_warning(unexplained, episode)):
+            if warning is not None:
+                self.bar.write(warning, file=sys.stderr)
         rows = [*self.history[:-1], last]
         draw_estimation(
             self.belief,

@@ -1,19 +1,26 @@
-"""Whether an episode can be explained under the priors at all, before any work is done."""
+"""Whether an episode can be explained under the priors at all, before any work is done, and whether
+a run that is asked about it can be trusted."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from tpcd.belief.belief import Belief
 from tpcd.belief.prior import make_prior
+from tpcd.commands.estimation import STEPS_FILE
 from tpcd.contact import scene_from_parameters, terrain_gaps
+from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
+from tpcd.files import read_json
 from tpcd.parameters import Parameters
+from tpcd.results import RESULTS_FILE
 from tpcd.shape.protocol import Shape
 
 DRAWS = 1000
@@ -70,6 +77,20 @@ def contradicted_start(episode: Episode, belief: Belief) -> str:
         f"{_start_of(episode)} is at least {depth:.0f} mm inside the {where} that the rows after it"
         " tell of; the estimate is not to be trusted: measure the start again, free of contact"
     )
+
+
+def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
+    """What is suspicious about predicting these episodes from a run."""
+    found = []
+    if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
+        found.append(f"{run} was stopped before its last row; its belief is of the rows so far")
+    if (run / RESULTS_FILE).is_file():
+        contradicted = read_json(run / RESULTS_FILE).get("contradicted")
+        found += [f"{run} was learnt from {contradicted}"] if contradicted else []
+    for episode in episodes:
+        name = "" if episode.path is None else f"{episode.path.name}: "
+        found += [name + each for each in check_episode(episode) if each != NO_CONTACT]
+    return found
 
 
 def _refuse_inside(

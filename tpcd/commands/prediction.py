@@ -7,7 +7,6 @@ read (the episode's noise included) or of what is true, as asked.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,35 +16,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.commands.estimation import STEPS_FILE
-from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
 from tpcd.data.files import write_together
 from tpcd.data.table import encode_table
-from tpcd.files import read_json
 from tpcd.planar import wrap_angle
 from tpcd.predict import LEAST_STD, ContactPredictor
 from tpcd.prediction import CHANNELS, Prediction
-from tpcd.results import RESULTS_FILE
 
 CHANNEL_UNITS = ("m", "m", "rad", "N", "N", "N·m")
 ROLLOUT_SAMPLES = 400
 LEAST_LOAD = 1e-3
 """Noise-free wrench from which a row counts as contact [N, N·m]."""
-
-
-def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
-    """What is suspicious about predicting these episodes from a run."""
-    found = []
-    if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
-        found.append(f"{run} was stopped before its last row; its belief is of the rows so far")
-    if (run / RESULTS_FILE).is_file():
-        contradicted = read_json(run / RESULTS_FILE).get("contradicted")
-        found += [f"{run} was learnt from {contradicted}"] if contradicted else []
-    for episode in episodes:
-        name = "" if episode.path is None else f"{episode.path.name}: "
-        found += [name + each for each in check_episode(episode) if each != NO_CONTACT]
-    return found
 
 
 @dataclass(frozen=True)

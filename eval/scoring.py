@@ -18,8 +18,6 @@ def score_tests(
 ) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "n 6"], Bool[Tensor, " n"]]:
     """Absolute errors of the mean [m, m, rad, N, N, N·m], the predicted distribution functions at
     the truth, and which rows touch, for all rows of the recordings, from noisy measured poses.
-
-    In free motion the arm reaches its command: those rows are certain, and flatter coverage.
     """
     errors, transforms = [], []
     for test in tests:

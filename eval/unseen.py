@@ -55,7 +55,7 @@ class Unseen:
     out: Path = Path("runs/unseen")
     """Folder for the results; a stopped run in it goes on with --resume."""
     priors: tuple[str, ...] = ("ycb21-z2", "ycb-rich-holdout")
-    """Shape priors to compare."""
+    """Shape priors to compare: folders or shipped names."""
     objects: tuple[str, ...] = ()
     """YCB objects; none named means all 22."""
     seeds: tuple[int, ...] = (0,)
@@ -99,7 +99,7 @@ def evaluate_unseen(config: Unseen) -> None:
     from tpcd.figures.sinks import save_figure
     from tpcd.prediction import CHANNELS
     from tpcd.results import continue_run, format_table, open_run, write_results
-    from tpcd.shape.checkpoint import find_prior
+    from tpcd.shape.checkpoint import find_prior, load_prior
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)
@@ -122,7 +122,8 @@ def evaluate_unseen(config: Unseen) -> None:
         for name, prior, seed in tqdm(plan, unit="cell", initial=0):
             if (name, prior, seed) in done:
                 continue
-            cell = _cell(config, name, outlines[name].vertices, priors[prior], seed)
+            shape = load_prior(priors[prior])
+            cell = _cell(config, name, outlines[name].vertices, prior, shape, seed)
             write_line(lines, cell)
             cells.append(cell)
     columns = [key for key in cells[0] if key not in ("contact_transform", "theta_score")]
@@ -149,7 +150,9 @@ def evaluate_unseen(config: Unseen) -> None:
     print(f"results in {folder}")
 
 
-def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> dict[str, Any]:
+def _cell(
+    config: Unseen, name: str, vertices: Any, prior: str, shape: Any, seed: int
+) -> dict[str, Any]:
     """One object and prior: explore, estimate, predict; returns its row of the table."""
     import time
     import zlib
@@ -161,7 +164,6 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     from tpcd.exploration import Estimator
     from tpcd.predict import ContactPredictor
     from tpcd.prediction import CHANNELS
-    from tpcd.shape.checkpoint import find_prior, load_prior
     from tpcd.truth.recording import make_motion, record
     from tpcd.truth.scene import draw_scene, make_truth
 
@@ -175,7 +177,6 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
 
     exploration = recorded(config.policy, config.steps)
     tests = [recorded("test", config.test_steps) for _ in range(config.tests)]
-    shape = load_prior(prior)
     started = time.perf_counter()
     sampler = torch.Generator().manual_seed(seed)
     settings = EstimatorSettings(
@@ -194,7 +195,7 @@ def _cell(config: Unseen, name: str, vertices: Any, prior: str, seed: int) -> di
     score = (belief.mean()[z:] - truth_vector) / belief.std()[z:]
     row: dict[str, Any] = {
         "object": name,
-        "prior": find_prior(prior).resolve().name,
+        "prior": prior,
         "seen": name in SEEN,
         "seed": seed,
     }

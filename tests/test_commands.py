@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from tpcd.commands.drawing import central_outline
 from tpcd.commands.unexplained import unexplained_rows, unexplained_warning
 from tpcd.data import read_episode, write_episode
 from tpcd.data.table import read_table
+from tpcd.predict import ContactPredictor
+from tpcd.prediction import Prediction
 
 
 @pytest.fixture(scope="module")
@@ -26,23 +29,50 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_world(tmp_path_factory.mktemp("world"))
 
 
-def test_rows_that_an_estimate_does_not_explain_are_told(world: Path) -> None:
+def test_rows_that_a_belief_does_not_explain_are_found(
+    world: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     belief, episode = load_belief(world / "run"), read_episode(world / "explore.csv")
     assert unexplained_rows(episode, belief) == []
     assert json.loads((world / "run" / "summary.json").read_text())["unexplained_rows"] == []
-    # Poses that were not reached; the wrench says otherwise, and the arm obeys it.
     last = len(episode) - 1
     poses = episode.poses.clone()
     poses[last, 1] += 0.01
     (found,) = unexplained_rows(replace(episode, poses=poses), belief)
     assert (found["row"], found["channel"]) == (last, "z") and found["deviations"] > 20
-    assert unexplained_warning([found], episode) is None
-    poses[2::2, 1] += 0.01
-    moved = replace(episode, poses=poses)
-    rows = unexplained_rows(moved, belief)
-    assert {row["row"] for row in rows} >= set(range(2, len(episode), 2))
-    told = unexplained_warning(rows, moved)
-    assert told is not None and f"{len(rows)} of {last} rows" in told and "diagnose.py" in told
+    assert unexplained_warning([found], last) is None
+    # What no particle has an answer to is not explained either.
+    predict = ContactPredictor.predict
+
+    def unanswered(*arguments: Any, **settings: Any) -> Prediction:
+        answer = predict(*arguments, **settings)
+        answered = answer.answered.clone()
+        answered[2:5] = False
+        weights = torch.where(answered, answer.weights, torch.nan)
+        return replace(answer, answered=answered, weights=weights)
+
+    monkeypatch.setattr(ContactPredictor, "predict", unanswered)
+    rows = unexplained_rows(episode, belief)
+    assert [(row["row"], row["deviations"]) for row in rows] == [(3, None), (4, None), (5, None)]
+    assert f"3 of {last} rows" in str(unexplained_warning(rows, last))
+
+
+def test_many_rows_that_are_not_explained_are_told(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    episode = read_episode(world / "explore.csv")
+    poses = episode.poses.clone()
+    poses[2::2, 1] += 0.05  # The wrench says otherwise.
+    path = write_episode(replace(episode, poses=poses), tmp_path / "moved")
+    settings = ("--prior", PRIOR, "--particles", "100", "--out", str(tmp_path / "run"))
+    assert call("estimate", str(path), *settings) == 0
+    told = capsys.readouterr().err
+    assert f"of {len(episode) - 1} rows lie more than 5" in told and "diagnose.py" in told
+    rows = json.loads((tmp_path / "run" / "summary.json").read_text())["unexplained_rows"]
+    assert {row["row"] for row in rows} >= {2, 4, 6}
+    arguments = (str(tmp_path / "run"), str(world / "test.csv"), "--out", str(tmp_path / "p.csv"))
+    call("predict", *arguments)
+    assert "of what it was learnt from" in capsys.readouterr().err
 
 
 def test_an_estimate_leaves_a_complete_run(world: Path) -> None:

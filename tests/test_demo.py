@@ -26,7 +26,8 @@ def test_the_demo_learns_an_object_says_how_well_and_runs_again(tmp_path: Path) 
     assert "next:  tensorboard --logdir" in done.stdout
     table = json.loads((out / "results.json").read_text())["table"]
     assert [row["channel"] for row in table] == ["x", "z", "phi", "F_x", "F_z", "tau"]
-    assert all(row["rows"] == 24 and 0 < row["mae"] < 1 for row in table)
+    assert all(row["rows"] == 24 for row in table)
+    assert all(0 < row["mae"] < 0.03 for row in table[:3])  # m, m, rad
     figures = {path.stem for path in (out / "figures").glob("*.png")}
     assert figures == {"estimation", "outline", "scene", "test_0", "test_1", "calibration"}
     # A second one takes its place.

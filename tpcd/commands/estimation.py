@@ -31,7 +31,7 @@ from tpcd.exploration import Closing
 from tpcd.files import write_json, write_text
 from tpcd.simulator.native import available
 
-STEPS_FILE = "steps.jsonl"
+STEPS_FILE, SUMMARY_FILE = "steps.jsonl", "summary.json"
 FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
 HEAVY_TAIL = 0.7
@@ -138,12 +138,12 @@ class EstimationRun:
         if self.belief is None or self.state is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
         last = self._close(episode) or self.history[-1]
-        unexplained = unexplained_rows(episode, self.belief)
-        summary = {**summarise(self.belief), "unexplained_rows": unexplained}
-        write_json(self.folder / "summary.json", summary)
-        for warning in (few_draws_warning(last), unexplained_warning(unexplained, episode)):
+        rows, unexplained = len(episode) - 1, unexplained_rows(episode, self.belief)
+        summary = {**summarise(self.belief), "rows": rows, "unexplained_rows": unexplained}
+        write_json(self.folder / SUMMARY_FILE, summary)
+        for warning in (few_draws_warning(last), unexplained_warning(unexplained, rows)):
             if warning is not None:
-                self.bar.write(warning, file=sys.stderr)
+                self.bar.write(f"warning: {warning}", file=sys.stderr)
         rows = [*self.history[:-1], last]
         draw_estimation(
             self.belief,
@@ -189,7 +189,7 @@ def few_draws_warning(row: dict[str, Any]) -> str | None:
         "" if shape is None else f" and a tail shape of {shape:.1f} (reliable up to {HEAVY_TAIL})"
     )
     return (
-        f"warning: few draws carry the belief after step {row['step']}, with an effective sample "
+        f"few draws carry the belief after step {row['step']}, with an effective sample "
         f"size of {size:.0f}{tail}: intervals of theta may be too narrow; compare other seeds"
     )
 

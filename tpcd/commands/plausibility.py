@@ -12,7 +12,8 @@ from torch import Tensor
 
 from tpcd.belief.belief import Belief
 from tpcd.belief.prior import make_prior
-from tpcd.commands.estimation import STEPS_FILE
+from tpcd.commands.estimation import STEPS_FILE, SUMMARY_FILE
+from tpcd.commands.unexplained import unexplained_warning
 from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
@@ -87,6 +88,11 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
     if (run / RESULTS_FILE).is_file():
         contradicted = read_json(run / RESULTS_FILE).get("contradicted")
         found += [f"{run} was learnt from {contradicted}"] if contradicted else []
+    if (run / SUMMARY_FILE).is_file():
+        summary = read_json(run / SUMMARY_FILE)
+        unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))
+        told = unexplained_warning(unexplained, rows) if unexplained else None
+        found += [f"{run}: of what it was learnt from, {told}"] if told else []
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "
         found += [name + each for each in check_episode(episode) if each != NO_CONTACT]

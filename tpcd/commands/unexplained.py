@@ -28,25 +28,32 @@ MANY = 3
 @torch.no_grad()
 def unexplained_rows(episode: Episode, belief: Belief) -> list[dict[str, Any]]:
     """The rows that lie further than `FAR` from what the belief predicts of them one step ahead,
-    noise included: `row`, the `channel` that is furthest off, and by how many `deviations`."""
+    noise included: `row` (0 is the free start), the `channel` that is furthest off, and by how many
+    `deviations`, without a sign; both None where no particle has an answer."""
     found = one_step(ContactPredictor(belief), episode, "measured")
-    off = prediction_error(measured_rows(episode)[1:], found.mean) / found.std
-    most, channel = off.abs().max(-1)
+    off = (prediction_error(measured_rows(episode)[1:], found.mean) / found.std).abs()
+    most, channel = off.max(-1)
     return [
-        {"row": k + 1, "channel": CHANNELS[int(channel[k])], "deviations": float(most[k])}
-        for k in torch.nonzero(most > FAR).flatten().tolist()
+        {
+            "row": k + 1,
+            "channel": CHANNELS[int(channel[k])] if found.answered[k] else None,
+            "deviations": float(most[k]) if found.answered[k] else None,
+        }
+        for k in torch.nonzero(~found.answered | (most > FAR)).flatten().tolist()
     ]
 
 
-def unexplained_warning(found: list[dict[str, Any]], episode: Episode) -> str | None:
-    """One line where many of an episode's rows are not explained; else None."""
-    total = len(episode) - 1
+def unexplained_warning(found: list[dict[str, Any]], total: int) -> str | None:
+    """One line where at least `LARGE_SHARE` of a `total` of rows, and at least `MANY`, are not
+    explained; else None."""
     if len(found) < max(MANY, LARGE_SHARE * total):
         return None
-    worst = max(found, key=lambda row: row["deviations"])
+    worst = max(found, key=lambda row: row["deviations"] or 0.0)
+    most = ""
+    if worst["deviations"] is not None:
+        most = f" (row {worst['row']}: {worst['channel']} by {worst['deviations']:.0f})"
     return (
-        f"warning: {len(found)} of {total} rows lie more than {FAR:.0f} standard deviations from"
-        f" what was learnt (row {worst['row']}: {worst['channel']} by {worst['deviations']:.0f}):"
-        " the estimate is not to be trusted; check the recording, or let scripts/diagnose.py find"
-        " what the model lacks"
+        f"{len(found)} of {total} rows lie more than {FAR:.0f} standard deviations from what was"
+        f" learnt{most}: the estimate is not to be trusted; check the recording, its stiffness and"
+        " sensor_std, or let scripts/diagnose.py find what the model lacks"
     )

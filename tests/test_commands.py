@@ -62,7 +62,7 @@ def test_many_rows_that_are_not_explained_are_told(
 ) -> None:
     episode = read_episode(world / "explore.csv")
     poses = episode.poses.clone()
-    poses[2::2, 1] += 0.05  # The wrench says otherwise.
+    poses[2::2, 1] -= 0.05  # The wrench says otherwise.
     path = write_episode(replace(episode, poses=poses), tmp_path / "moved")
     settings = ("--prior", PRIOR, "--particles", "100", "--out", str(tmp_path / "run"))
     assert call("estimate", str(path), *settings) == 0
@@ -73,6 +73,20 @@ def test_many_rows_that_are_not_explained_are_told(
     arguments = (str(tmp_path / "run"), str(world / "test.csv"), "--out", str(tmp_path / "p.csv"))
     call("predict", *arguments)
     assert "of what it was learnt from" in capsys.readouterr().err
+
+
+def test_a_start_inside_of_what_later_rows_press_on_is_refused(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    episode = read_episode(world / "explore.csv")
+    poses, commands = episode.poses.clone(), episode.commands.clone()
+    poses[0, 1] -= 0.08
+    commands[0, 1] -= 0.08
+    path = write_episode(replace(episode, poses=poses, commands=commands), tmp_path / "low")
+    assert call("estimate", str(path), "--prior", PRIOR, "--out", str(tmp_path / "run")) == 2
+    told = capsys.readouterr().err
+    assert "row 0" in told and "mm inside the floor" in told
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_estimate_leaves_a_complete_run(world: Path) -> None:

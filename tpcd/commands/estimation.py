@@ -138,10 +138,10 @@ class EstimationRun:
         if self.belief is None or self.state is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
         last = self._close(episode) or self.history[-1]
-        rows, unexplained = len(episode) - 1, unexplained_rows(episode, self.belief)
-        summary = {**summarise(self.belief), "rows": rows, "unexplained_rows": unexplained}
+        total, unexplained = len(episode) - 1, unexplained_rows(episode, self.belief)
+        summary = {**summarise(self.belief), "rows": total, "unexplained_rows": unexplained}
         write_json(self.folder / SUMMARY_FILE, summary)
-        for warning in (few_draws_warning(last), unexplained_warning(unexplained, rows)):
+        for warning in (few_draws_warning(last), unexplained_warning(unexplained, total)):
             if warning is not None:
                 self.bar.write(f"warning: {warning}", file=sys.stderr)
         rows = [*self.history[:-1], last]

@@ -21,6 +21,7 @@ from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 from tpcd.files import read_json
 from tpcd.parameters import Parameters
+from tpcd.planar import wrap_angle
 from tpcd.results import RESULTS_FILE
 from tpcd.shape.protocol import Shape
 
@@ -33,6 +34,11 @@ OUTLINE_DEVIATIONS = 3.0
 LARGEST_MISFIT = 0.02
 """where that is less than this [m]: a larger one is made up for the start's sake."""
 TERRAINS = ("floor", "wall")
+LOAD_DEVIATIONS = 5.0
+"""A row presses on a terrain where its force exceeds so many standard deviations of the sensor."""
+TOO_DEEP, LONGEST_LEVER = 0.01, 0.3
+"""The start may be this much deeper than a row that presses [m], and by so much more for each
+radian that it is turned from it [m]."""
 
 
 def check_start_pose(episode: Episode, shape: Shape) -> None:
@@ -42,10 +48,38 @@ def check_start_pose(episode: Episode, shape: Shape) -> None:
     free, the poses are in another frame or the priors belong to another scene. Raises
     `EpisodeError` that says how deep the shallowest draw is.
     """
+    _check_start_of_rows(episode)
     prior = make_prior(shape, episode.priors)
     draws = prior.sample(DRAWS, torch.Generator().manual_seed(0))
     remedy = "check the frame of the poses, or give floor_height and wall_position under priors"
     _refuse_inside(episode, shape, prior.to_parameters(draws), "draws from the priors", remedy)
+
+
+def _check_start_of_rows(episode: Episode) -> None:
+    """Refuse a free start that is far beyond where a later row at nearly its angle presses on floor
+    or wall, whatever the shape is.
+
+    On flat terrain the gap depends on the angle and on one coordinate alone. A force counts that no
+    friction of the other terrain makes, which is less than that terrain's load.
+    """
+    turned = wrap_angle(episode.poses[1:, 2] - episode.poses[0, 2]).abs()
+    x, z = (episode.poses[1:] - episode.poses[0])[:, :2].unbind(-1)
+    push, lift = -episode.wrenches[1:, 0], episode.wrenches[1:, 1]
+    for terrain, depth, load, other, noise in (
+        ("floor", z, lift, push, episode.sensor_std[4]),
+        ("wall", -x, push, lift, episode.sensor_std[3]),
+    ):
+        excess = depth - TOO_DEEP - LONGEST_LEVER * turned
+        excess = torch.where(load > other.abs() + LOAD_DEVIATIONS * noise, excess, -torch.inf)
+        row = int(excess.argmax())
+        if excess[row] > 0:
+            raise EpisodeError(
+                episode.path or "episode",
+                f"{_start_of(episode)} is {1e3 * float(depth[row]):.0f} mm inside the {terrain}"
+                f" that row {row + 1} presses on at nearly the same angle, expected a pose free of"
+                " contact",
+                "measure the start again, or check the frame of the poses",
+            )
 
 
 def check_start_of(episode: Episode, belief: Belief) -> None:

@@ -169,6 +169,26 @@ def test_compiled_loops_and_torch_agree_where_the_ground_gives_way(
     assert (found.total[likely] - plain[likely]).abs().max() > 1
 
 
+@pytest.mark.parametrize("effect", ["floor_compliance", "grasp_compliance", "force_bias"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_where_no_particle_has_a_chance_none_is_evaluated(
+    shape: PolygonShape,
+    episode: Episode,
+    particles: Tensor,
+    effect: str,
+    compiled: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if not compiled:
+        monkeypatch.setattr(native, "available", lambda: False)
+    added = Added((found := find_effect(effect),), torch.zeros(3, len(found.parameters)).double())
+    sd = torch.full((3,), FIELD.sd, dtype=torch.float64)
+    parameters = Parameters.from_vector(particles[:3])
+    arguments = (shape, parameters, sd, history_of(episode), FIELD, StepSettings())
+    assert (history_likelihood(*arguments, torch.full_like(sd, torch.inf), added=added).total
+            == -torch.inf).all()  # fmt: skip
+
+
 @pytest.mark.parametrize("compiled", [True, False])
 def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
     shape: PolygonShape,

@@ -136,7 +136,12 @@ def test_a_simulator_that_lifts_what_slides_is_called_numerics(shape: PolygonSha
 
 @pytest.mark.parametrize(
     ("evidence", "used", "draws"),
-    [([5.0, 4.0, 90.0], 2, 40), ([50.0, 90.0, 95.0, 200.0], 3, 40), ([5.0, 4.0], 2, 1)],
+    [
+        ([5.0, 4.0, 90.0], 2, 12),
+        ([50.0, 90.0, 95.0, 200.0], 3, 40),
+        ([5.0, 4.0], 2, 1),
+        ([5.0], 0, 60),
+    ],
 )
 def test_the_model_found_is_fitted_again_while_the_search_climbs(
     shape: PolygonShape,

@@ -61,7 +61,7 @@ def compiled_filter(
         settings.follow_path,
     )
     rows = (merged.poses, merged.variance, conditions.give.expand(-1, n + 1, -1), rest)
-    seen = max(len(value) for value in rows)
+    (seen,) = torch.broadcast_shapes(*(value.shape[:1] for value in rows))
     poses, variance, give, rest = (value.expand(seen, *value.shape[1:]) for value in rows)
     values, slopes = field.basis(setting.angles)
     measured = Measured(
@@ -132,7 +132,7 @@ def compiled_filter(
 
 def _alike(*values: Tensor) -> list[Tensor]:
     """Values (m, r, ...) whose first two axes are made the same."""
-    m, r = (max(value.shape[axis] for value in values) for axis in (0, 1))
+    m, r = torch.broadcast_shapes(*(value.shape[:2] for value in values))
     return [value.expand(m, r, *value.shape[2:]) for value in values]
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, start_cloud
 from tpcd.belief.importance import draw_pool
-from tpcd.belief.modes import find_modes
+from tpcd.belief.pool import Pool
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
@@ -25,8 +25,14 @@ from tpcd.discrepancy.fit import Fit, Question, fit_stream
 from tpcd.effects.protocol import Effect
 from tpcd.simulator import StepSettings
 
-STAGES = (0.2, 0.5)
-"""Shares of the transitions on which modes are sought first."""
+FIRST = {"flat_rounds": 0, "rough": True, "draws": 500}
+"""Of the first draws, which only tell what touched: flat coordinates hang on that."""
+PASSES = 5
+"""Times at most that draws are made again."""
+CLIMBS = 1.0
+"""Gain of log evidence with which they are,"""
+ENOUGH = 10
+"""and effective number below which."""
 
 
 def fit_model(
@@ -69,28 +75,24 @@ def _fitted(
     places: Float[Tensor, "k s"] | None,
     generator: torch.Generator,
 ) -> Cloud:
-    """The particles of one seed."""
+    """The particles of one seed: drawn again and again, each time from where the draws before lie,
+    while that explains the data better or few of them count."""
     begin = start_cloud(target.sample(sampler.particles, generator))
     remembered = [carried(fit, target.prior, generator) for fit in start]
-    remembered.append(_early_modes(target, sampler, generator))
     if places is not None:
         remembered.append(places)
-    begin = replace(begin, modes=torch.cat(remembered))
-    return draw_pool(begin, target, 1, sampler, generator).cloud(sampler.particles, generator)
+    if remembered:
+        begin = replace(begin, modes=torch.cat(remembered))
 
+    def drawn(cloud: Cloud, sampler: SamplerSettings) -> Pool:
+        return draw_pool(cloud, target, 1, sampler, generator)
 
-def _early_modes(
-    target: ContactTarget, sampler: SamplerSettings, generator: torch.Generator
-) -> Float[Tensor, "k s"]:
-    """Modes carried from a short history to longer ones: the first transitions leave fewer ways
-    to be stuck than all of them."""
-    assert target.history is not None
-    modes = torch.zeros(0, target.prior.dimension + 1, dtype=torch.float64)
-    if sampler.fresh_modes == 1:
-        return modes
-    for share in STAGES:
-        count = max(1, round(share * len(target.history)))
-        modes = find_modes(
-            target.given(target.history.first(count)), modes, sampler, generator
-        ).points
-    return modes
+    if not sampler.flat_rounds:
+        return drawn(begin, sampler).cloud(sampler.particles, generator)
+    pool = drawn(begin, replace(sampler, **FIRST))
+    for _ in range(PASSES):
+        before, pool = pool, drawn(pool.cloud(sampler.particles, generator), sampler)
+        climbs = pool.log_evidence > before.log_evidence + CLIMBS
+        if not climbs and pool.effective_sample_size >= ENOUGH:
+            break
+    return pool.cloud(sampler.particles, generator)

@@ -25,15 +25,21 @@ from tpcd.simulator import StepSettings
 
 FIT_SAMPLER = SamplerSettings(
     particles=300,
-    places=80,
-    draws_per_place=9,
-    rounds=3,
-    draws=2000,
-    flat_rounds=0,
+    places=60,
+    draws_per_place=6,
+    rounds=1,
+    draws=1500,
+    flat_rounds=4,
+    flat_worth=60.0,
+    flat_starts=4000,
+    flat_enough=1000,
+    flat_tried=600,
+    flat_climbers=60,
+    flat_draws=400,
     rough=False,
-    prior_draws=500,
-    modes=20,
-    fresh_modes=120,
+    prior_draws=100,
+    modes=16,
+    fresh_modes=20,
 )
 """Budget of one fit on one seed."""
 TIED = 8.0

@@ -18,6 +18,7 @@ from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
+    BEATEN,
     CLEAR,
     FRESH,
     IMPROVED,
@@ -58,15 +59,20 @@ def name_one(
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
     worth = current.log_evidence + WORTH_FITTING[adequate]
-    chosen = [g.effect for g in glances[: settings.full_fits] if g.log_evidence > worth]
+    chosen = [g for g in glances[: settings.full_fits] if g.log_evidence > worth]
     places = {g.effect.name: g.place[None] for g in glances}
 
     def fitted(effect: Effect) -> Fit:
         effects, found = (*current.effects, effect), places[effect.name]
         return fit_model(question, effects, (0,), start=(current,), places=found)
 
-    fits = each_of(bench, chosen, number, fitted)
-    top = max((fit.log_evidence for fit in fits), default=-math.inf)
+    fits: list[Fit] = []
+    top = -math.inf
+    for look in chosen:
+        if look.log_evidence < top - BEATEN:
+            break
+        fits += each_of(bench, [look.effect], number, fitted)
+        top = max((fit.log_evidence for fit in fits), default=-math.inf)
     near = [
         fitted_again(bench, fit, 1, (current,), places=places[fit.names[-1]])
         if fit.log_evidence > current.log_evidence

@@ -18,7 +18,13 @@ from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit
 from tpcd.discrepancy.naming import pruned
 from tpcd.discrepancy.screening import Glance, glance
-from tpcd.discrepancy.settings import AMBIGUOUS, FRESH, RIVAL_SEEDS, WITHIN
+from tpcd.discrepancy.settings import (
+    AMBIGUOUS,
+    FRESH,
+    NEARLY_OUTDONE,
+    RIVAL_SEEDS,
+    RIVAL_WITHIN,
+)
 from tpcd.discrepancy.workbench import (
     Round,
     Workbench,
@@ -72,7 +78,7 @@ def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round
     if best is None:
         return Round(current)
     rival, fit = best
-    if fit.log_evidence - rival.price > current.log_evidence - WITHIN:
+    if fit.log_evidence - rival.price > current.log_evidence - NEARLY_OUTDONE:
         current, (fit,) = looked_closer(bench, current, [fit], RIVAL_SEEDS)
     taken, reason = stands(bench, fit, current, rival.price, _number(bench, rival))
     if taken and explained and bench.settings.adequacy:
@@ -101,7 +107,7 @@ def _chosen(bench: Workbench, base: Fit, current: Fit, explained: bool) -> list[
     rivals = sorted(best.values(), key=lambda rival: -rival.worth)
     if not explained:
         return rivals[:FULL_FITS]
-    return [one for one in rivals[:1] if one.worth > current.log_evidence - WITHIN]
+    return [one for one in rivals[:1] if one.worth > current.log_evidence - RIVAL_WITHIN]
 
 
 def _questions(

@@ -26,6 +26,7 @@ from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import better_base, find_confusions, name_one, pruned
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import (
+    ENOUGH_DRAWS,
     FEWEST_DRAWS,
     FEWEST_ROWS,
     FINAL_SEEDS,
@@ -76,7 +77,8 @@ def _question(
         history = replace(history, parity_counts=False)
     sampler = settings.sampler
     if not settings.from_prior:
-        sampler = replace(sampler, fresh_modes=1, prior_draws=1)
+        none = ("prior_draws", "fresh_modes", "flat_starts", "flat_tried", "flat_climbers")
+        sampler = replace(sampler, **dict.fromkeys(none, 1))
     return Question(
         history,
         make_prior(shape, episodes[0].priors),
@@ -194,13 +196,17 @@ def _changed_base(bench: Workbench, found: Round, explained: bool) -> tuple[Vari
 
 
 def fitted_out(bench: Workbench, fit: Fit) -> Fit:
-    """The model found on further seeds, for the sake of honest intervals: two, and on while one
-    finds much more than all before it, since the search is still climbing then."""
+    """The model found on further seeds, for the sake of honest intervals: two where few draws
+    count, and on while one finds much more than all before it, since the search is still climbing
+    then."""
+    climbs = False
     for count, seed in enumerate(FINAL_SEEDS):
+        enough = count >= 2 or effective_sample_size(fit.cloud.weights) >= ENOUGH_DRAWS
+        if enough and not climbs:
+            break
         best = max(fit.by_seed)
         fit = fitted_again(bench, fit, seed, (fit,))
-        if count > 0 and max(fit.by_seed) < best + TIED:
-            break
+        climbs = max(fit.by_seed) > best + TIED
     draws = effective_sample_size(fit.cloud.weights)
     if draws < FEWEST_DRAWS:
         bench.warn(

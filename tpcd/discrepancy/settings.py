@@ -18,12 +18,15 @@ and where it does not."""
 WORTH_FITTING = {True: -2.0, False: -25.0}
 """Gain of the quick look from which a candidate gets a full fit at all: where the model explains
 the data as it is, and where it does not."""
-WITHIN = 15.0
+BEATEN = 25.0
+"""A candidate whose quick look is so far below the best full fit gets none."""
+WITHIN = 8.0
 """Candidates whose gain is so close to the best get a second seed."""
 IMPROVED = 2.0
 """Gain of the base model fitted again from which the best candidates are fitted again too."""
 CLOSER = 3
-"""Times the budget with which a candidate that neither wins nor loses clearly is fitted again."""
+"""Times the places from which points climb where a candidate that neither wins nor loses clearly is
+fitted again."""
 CLOSER_SEEDS = (30, 31, 32)
 """Seeds of that, of which further ones are used while the search still climbs."""
 UNDECIDED = {True: 2.0, False: -10.0}
@@ -42,10 +45,16 @@ that static friction holds, is missed by the bootstrap in a third of its draws, 
 at 5 % would never let it pass."""
 RIVAL_SEEDS = (33, 34, 35)
 """Seeds of that for a formula in place of effects."""
+RIVAL_WITHIN = 15.0
+"""A formula is fitted in full where the quick look misses what it has to gain by no more,"""
+NEARLY_OUTDONE = 5.0
+"""and looked at more closely where the fit does."""
 FORMULA_COUNTS = 2
 """Effects that a formula counts for: it is as much less likely beforehand."""
 FINAL_SEEDS = tuple(range(20, 28))
-"""Further seeds of the model that was found, of which two or more are used."""
+"""Further seeds of the model that was found."""
+ENOUGH_DRAWS = 50
+"""Effective number of draws with which none is used."""
 FEWEST_DRAWS = 5
 """Effective number of draws below which intervals are said to be unsure."""
 

@@ -108,16 +108,13 @@ def fitted_again(
 def looked_closer(
     bench: Workbench, current: Fit, near: list[Fit], seeds: Sequence[int] = CLOSER_SEEDS
 ) -> tuple[Fit, list[Fit]]:
-    """The base model and the best candidate with a larger search, each from where both arrived:
+    """The base model and the best candidate with a wider search, each from where both arrived:
     where they are close, what the search over shapes has missed may decide. On while one of them
     finds much more than before, since the search is still climbing then."""
-    sampler = bench.settings.sampler
-    wide = replace(
-        bench.question,
-        sampler=replace(
-            sampler, fresh_modes=CLOSER * sampler.fresh_modes, draws=CLOSER * sampler.draws
-        ),
-    )
+    sampler = bench.question.sampler
+    names = ("fresh_modes", "flat_starts", "flat_tried", "flat_climbers")
+    more = {name: CLOSER * getattr(sampler, name) for name in names}
+    wide = replace(bench.question, sampler=replace(sampler, **more))
     for seed in seeds:
         both, others = (current, near[0]), near[1:]
         before = [max(fit.by_seed) for fit in both]

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.cloud import Cloud, start_cloud
+from tpcd.belief.cloud import Cloud, Target, start_cloud
 from tpcd.belief.importance import draw_pool
 from tpcd.belief.pool import Pool
 from tpcd.belief.settings import SamplerSettings
@@ -75,24 +75,29 @@ def _fitted(
     places: Float[Tensor, "k s"] | None,
     generator: torch.Generator,
 ) -> Cloud:
-    """The particles of one seed: drawn again and again, each time from where the draws before lie,
-    while that explains the data better or few of them count."""
+    """The particles of one seed."""
     begin = start_cloud(target.sample(sampler.particles, generator))
     remembered = [carried(fit, target.prior, generator) for fit in start]
     if places is not None:
         remembered.append(places)
     if remembered:
         begin = replace(begin, modes=torch.cat(remembered))
+    pool = draw_again(begin, target, sampler, generator)
+    return pool.cloud(sampler.particles, generator)
 
-    def drawn(cloud: Cloud, sampler: SamplerSettings) -> Pool:
-        return draw_pool(cloud, target, 1, sampler, generator)
 
+def draw_again(
+    begin: Cloud, target: Target, sampler: SamplerSettings, generator: torch.Generator
+) -> Pool:
+    """Draws that are made again and again, each time from where the draws before lie, while that
+    explains the data better or few of them count; once where the sampler has no flat rounds."""
     if not sampler.flat_rounds:
-        return drawn(begin, sampler).cloud(sampler.particles, generator)
-    pool = drawn(begin, replace(sampler, **FIRST))
+        return draw_pool(begin, target, 1, sampler, generator)
+    pool = draw_pool(begin, target, 1, replace(sampler, **FIRST), generator)
     for _ in range(PASSES):
-        before, pool = pool, drawn(pool.cloud(sampler.particles, generator), sampler)
+        cloud = pool.cloud(sampler.particles, generator)
+        before, pool = pool, draw_pool(cloud, target, 1, sampler, generator)
         climbs = pool.log_evidence > before.log_evidence + CLIMBS
         if not climbs and pool.effective_sample_size >= ENOUGH:
             break
-    return pool.cloud(sampler.particles, generator)
+    return pool

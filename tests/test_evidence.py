@@ -1,0 +1,82 @@
+"""Log evidence of models that a diagnosis weighs against each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from linear_model import LinearModel
+from torch import Tensor
+
+from tpcd.belief.cloud import Cloud, Target, start_cloud
+from tpcd.belief.pool import Pool
+from tpcd.belief.settings import SamplerSettings
+from tpcd.discrepancy import evidence
+from tpcd.discrepancy.evidence import PASSES, draw_again
+from tpcd.discrepancy.fit import FIT_SAMPLER
+
+MODEL = LinearModel(6)
+
+
+def again(sampler: SamplerSettings = FIT_SAMPLER) -> Pool:
+    """Draws that begin at draws from the prior."""
+    generator, target = torch.Generator().manual_seed(3), MODEL.target(6)
+    begin = start_cloud(target.sample(sampler.particles, generator))
+    return draw_again(begin, target, sampler, generator)
+
+
+def test_the_evidence_of_a_linear_model_is_the_known_one() -> None:
+    pool = again()
+    mean, covariance, log_evidence = MODEL.posterior(6)
+    assert abs(pool.log_evidence - log_evidence) < 0.1
+    away = pool.log_weights.softmax(0) @ pool.positions - mean
+    assert (away.abs() < 0.3 * covariance.diagonal().sqrt()).all()
+
+
+class MadeUp:
+    """Draws whose evidence and effective number are told, and what was asked for them."""
+
+    def __init__(self, told: list[tuple[float, int]]) -> None:
+        self.told = told
+        self.asked: list[SamplerSettings] = []
+        self.begun: list[Tensor] = []
+
+    def pool(
+        self, cloud: Cloud, target: Target, datum: int, settings: SamplerSettings, *_: object
+    ) -> Pool:
+        log_evidence, worth = self.told[len(self.asked)]
+        self.begun.append(cloud.positions)
+        self.asked.append(settings)
+        positions = torch.full((100, 3), float(len(self.asked)), dtype=torch.float64)
+        weights = torch.full((100,), -torch.inf, dtype=torch.float64)
+        weights[:worth] = log_evidence + torch.tensor(100.0 / worth).double().log()
+        return Pool(positions, weights, weights, positions[:1], torch.ones(1).double(), 0)
+
+
+@pytest.mark.parametrize(
+    ("told", "often"),
+    [
+        ([(0, 90), (5, 90), (5.5, 90), (99, 90)], 3),  # until it explains no more
+        ([(0, 90), (-5, 90), (99, 90)], 2),  # or less
+        ([(0, 90), (0, 2), (-3, 2), (-3, 50), (99, 90)], 4),  # but on while few count
+        ([(10 * k, 50) for k in range(20)], 1 + PASSES),  # and not for ever
+    ],
+)
+def test_draws_are_made_again_from_where_the_last_ones_are(
+    told: list[tuple[float, int]], often: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draws = MadeUp(told)
+    monkeypatch.setattr(evidence, "draw_pool", draws.pool)
+    assert abs(again().log_evidence - told[often - 1][0]) < 1e-6
+    assert len(draws.asked) == often
+    first, *others = draws.asked
+    assert first.flat_rounds == 0 and first.rough and others == [FIT_SAMPLER] * (often - 1)
+    assert all((begun == k + 1).all() for k, begun in enumerate(draws.begun[1:]))
+
+
+def test_without_flat_rounds_draws_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    draws, sampler = MadeUp([(3, 2)]), replace(FIT_SAMPLER, flat_rounds=0)
+    monkeypatch.setattr(evidence, "draw_pool", draws.pool)
+    assert again(sampler).log_evidence == pytest.approx(3)
+    assert draws.asked == [sampler]

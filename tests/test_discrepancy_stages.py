@@ -12,14 +12,16 @@ from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import naming, search
+from tpcd.discrepancy import naming, search, workbench
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Alternative
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
+from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
+from tpcd.discrepancy.settings import BEATEN, CLOSER
 from tpcd.discrepancy.workbench import Round, Workbench
 from tpcd.effects import Effect, find_effect
 from tpcd.effects.formula import FORMULAS
@@ -175,3 +177,47 @@ def test_another_shape_need_only_be_as_good_as_an_effect(
     found = naming.better_base(bench, fit(0.0), None if rival is None else fit(rival), False)
     assert (None if found is None else found[0].name) == chosen
     assert SETTINGS.least_gain == 6.0
+
+
+def test_what_looks_far_worse_than_a_full_fit_gets_none(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second looks less than `BEATEN` below what the first is worth, the third more."""
+    bench = bench_of(episode)
+    worth = dict(zip((e.name for e in CATALOGUE), (100.0, 80.0, 70.0), strict=True))
+    looks = [Glance(e, worth[e.name], (1.0,), torch.zeros(1)) for e in CATALOGUE]
+    fitted: list[str] = []
+
+    def fit(question: Question, effects, seeds, *_, **__) -> Fit:
+        fitted.extend(effect.name for effect in effects)
+        return Fit(tuple(effects), question.step, question.scene, (100.0,), ())
+
+    monkeypatch.setattr(naming, "_glances", lambda *_: looks)
+    monkeypatch.setattr(naming, "fit_model", fit)
+    monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
+    monkeypatch.setattr(naming, "looked_closer", lambda bench, current, near: (current, near))
+    base = Fit((), bench.question.step, bench.question.scene, (60.0,), ())
+    naming.name_one(bench, base, CATALOGUE, False)
+    assert fitted == [effect.name for effect in CATALOGUE[:2]]
+    assert 100.0 - 80.0 < BEATEN < 100.0 - 70.0
+
+
+def test_a_search_from_where_the_model_arrived_alone_stays_so_when_it_looks_closer(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    question = search._question(
+        [episode], PolygonShape(builtin_outlines()["mug"]), replace(SETTINGS, from_prior=False),
+        Memory(),
+    )  # fmt: skip
+    bench = replace(bench_of(episode), question=question)
+    asked: list[Question] = []
+
+    def again(bench: Workbench, fit: Fit, seed: int, start, question: Question) -> Fit:
+        asked.append(question)
+        return fit
+
+    monkeypatch.setattr(workbench, "fitted_again", again)
+    fit = Fit((), question.step, question.scene, (1.0,), ())
+    workbench.looked_closer(bench, fit, [fit])
+    assert len(asked) == 2  # once: nothing climbs
+    assert all(one.sampler.fresh_modes == one.sampler.flat_climbers == CLOSER for one in asked)

@@ -191,6 +191,17 @@ def test_what_was_found_is_fitted_again_before_it_gives_way(
     assert found.close == ()
 
 
+@pytest.mark.parametrize(("lead", "closer"), [(0.9, False), (1.1, True)])
+def test_a_formula_that_misses_its_price_by_much_is_not_looked_at_more_closely(
+    lead: float, closer: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has to gain 6 nats more than the effect, and would gain 50 if it were."""
+    stand = Stand(monkeypatch)
+    stand.evidence, stand.looks = {(FIELD.name,): 100.0 + lead}, {(FIELD.name,): 100.0}
+    stand.refitted = {(FIELD.name,): 150.0}
+    assert (stand.ask((WALL.name,)).best is not None) == closer
+
+
 @pytest.mark.parametrize(
     ("lead", "best", "close"),
     [(2.9, WALL, None), (3.1, WALL, FIELD), (8.9, FIELD, WALL), (9.1, FIELD, None)],

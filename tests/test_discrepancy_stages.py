@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tpcd.belief.cloud import start_cloud
 from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
@@ -22,6 +23,7 @@ from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.discrepancy.settings import BEATEN, CLOSER
+from tpcd.discrepancy.variants import strained
 from tpcd.discrepancy.workbench import Round, Workbench
 from tpcd.effects import Effect, find_effect
 from tpcd.effects.formula import FORMULAS
@@ -177,6 +179,19 @@ def test_another_shape_need_only_be_as_good_as_an_effect(
     found = naming.better_base(bench, fit(0.0), None if rival is None else fit(rival), False)
     assert (None if found is None else found[0].name) == chosen
     assert SETTINGS.least_gain == 6.0
+
+
+@pytest.mark.parametrize(("score", "strains"), [(2.5, False), (3.5, True)])
+def test_an_outline_error_beyond_its_prior_strains_a_model(
+    score: float, strains: bool, episode: Episode
+) -> None:
+    """Of two particles; the one without weight does not count."""
+    bench = bench_of(episode)
+    positions = torch.zeros(2, 8, dtype=torch.float64)
+    positions[:, -1] = torch.tensor([score, 60.0])
+    cloud = replace(start_cloud(positions), weights=torch.tensor([1.0, 0.0], dtype=torch.float64))
+    fit = Fit((), bench.question.step, bench.question.scene, (0.0,), (cloud,))
+    assert strained(fit) is strains
 
 
 def test_what_looks_far_worse_than_a_full_fit_gets_none(

@@ -32,7 +32,7 @@ from tpcd.discrepancy.settings import (
     FINAL_SEEDS,
     DiagnosisSettings,
 )
-from tpcd.discrepancy.variants import FINER, Variant, step_halving
+from tpcd.discrepancy.variants import FINER, Variant, step_halving, strained
 from tpcd.discrepancy.workbench import Round, Workbench, fit_well, fitted_again
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
@@ -139,7 +139,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             found = name_one(bench, current, pool, adequate, excited)
             untried = stage == 0 and not variants
             explained = _explains(bench, found.base)
-            if untried and not (explained and found.best is None):
+            if untried and not (explained and found.best is None and not strained(found.base)):
                 changed = _changed_base(bench, found, explained)
                 if changed is not None:
                     variant, current = changed

@@ -21,6 +21,9 @@ WIDER_MISFIT = 4.0
 """Widens the error of the outline that is expected."""
 FINER = 4
 """Times as many substeps."""
+STRAINED = 3.0
+"""Standard deviations from what the shape prior expects, in logarithms, from which the error of
+the outline is said to stand for something else."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,13 @@ FINER_STEPS = Variant("finer_steps", "friction depends on the path within a step
 VARIANTS = (WIDE_SHAPE, RELAXED_FRICTION, FINER_STEPS)
 NUMERICS = (RELAXED_FRICTION.name, FINER_STEPS.name)
 """Variants that are artefacts of simulators."""
+
+
+def strained(fit: Fit) -> bool:
+    """Whether a model explains the data with an error of the outline that its prior hardly allows:
+    such an error bends to much that is none."""
+    cloud = fit.cloud
+    return float(cloud.weights @ cloud.positions[:, -1]) > STRAINED
 
 
 def step_halving(question: Question, fit: Fit) -> float:

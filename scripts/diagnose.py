@@ -67,7 +67,8 @@ def diagnose_episodes(config: Diagnose) -> int:
     )
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
-    from tpcd.effects.model import Model, load_effects, load_model
+    from tpcd.effects.formula import FORMULAS
+    from tpcd.effects.model import Model, load_candidates, load_model
     from tpcd.results import format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
@@ -86,8 +87,8 @@ def diagnose_episodes(config: Diagnose) -> int:
         print(f"note: {note}")
     shape = load_prior(config.prior)
     model = Model() if config.model is None else load_model(config.model)
-    own = [effect for path in config.candidates for effect in load_effects(path)]
     settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
+    own = load_candidates(config.candidates, (*settings.catalogue, *FORMULAS))
     settings = replace(settings, catalogue=(*settings.catalogue, *own))
     with open_diagnosis(config, config.out, config.overwrite, config.resume) as folder:
         if data.answer is not None:

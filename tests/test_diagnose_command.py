@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from command_calls import PRIOR, call
 
+from tpcd.commands.diagnosing import fits_of
 from tpcd.discrepancy.coverage import NEEDED
 from tpcd.discrepancy.diagnosis import (
     Candidate,
@@ -116,6 +117,12 @@ def test_a_stopped_run_keeps_its_fits_and_goes_on(
     assert "whose seed is not the same" in capsys.readouterr().err
     assert call("diagnose", *words, "--resume") == 10
     assert told[0].salt == told[1].salt and not (out / "fits").exists()
+    # Code that was changed made other fits, committed or not.
+    monkeypatch.setattr("tpcd.commands.diagnosing.tpcd.__file__", str(tmp_path / "__init__.py"))
+    (tmp_path / "sampler.py").write_text("DRAWS = 1\n")
+    salt = fits_of(out, ()).salt
+    (tmp_path / "sampler.py").write_text("DRAWS = 2\n")
+    assert len({salt, fits_of(out, ()).salt, told[0].salt}) == 3
     assert call("diagnose", *words, "--resume") == 2
     assert "has its verdict" in capsys.readouterr().err
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,10 +12,14 @@ from torch import Tensor
 
 from tpcd.belief.cloud import Cloud, Target, start_cloud
 from tpcd.belief.pool import Pool
+from tpcd.belief.prior import make_prior
 from tpcd.belief.settings import SamplerSettings
 from tpcd.discrepancy import evidence
 from tpcd.discrepancy.evidence import PASSES, draw_again
-from tpcd.discrepancy.fit import FIT_SAMPLER
+from tpcd.discrepancy.fit import FIT_SAMPLER, Fit
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.polygon import PolygonShape
+from tpcd.simulator import StepSettings
 
 MODEL = LinearModel(6)
 
@@ -58,7 +63,8 @@ class MadeUp:
     ("told", "often"),
     [
         ([(0, 90), (5, 90), (5.5, 90), (99, 90)], 3),  # until it explains no more
-        ([(0, 90), (-5, 90), (99, 90)], 2),  # or less
+        ([(0, 90), (-5, 90), (99, 90)], 2),  # or less than rough ones
+        ([(0, 90), (9, 90), (5, 90), (5.5, 90), (99, 90)], 4),  # which later ones may not
         ([(0, 90), (0, 2), (-3, 2), (-3, 50), (99, 90)], 4),  # but on while few count
         ([(10 * k, 50) for k in range(20)], 1 + PASSES),  # and not for ever
     ],
@@ -80,3 +86,30 @@ def test_without_flat_rounds_draws_are_made_once(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(evidence, "draw_pool", draws.pool)
     assert again(sampler).log_evidence == pytest.approx(3)
     assert draws.asked == [sampler]
+
+
+def model(*by_seed: float, worth: float = 25.0) -> Fit:
+    """A fit with such evidence, on one particle a seed that is as many."""
+    shape = PolygonShape(builtin_outlines()["mug"])
+    clouds = tuple(
+        replace(
+            start_cloud(torch.full((1, 8), float(k), dtype=torch.float64)),
+            log_evidence=value,
+            log_evidence_std=worth**-0.5,
+        )
+        for k, value in enumerate(by_seed)
+    )
+    return Fit((), StepSettings(), make_prior(shape), by_seed, clouds)
+
+
+def test_seeds_that_missed_what_another_found_do_not_count() -> None:
+    assert model(5.0, 5.0).log_evidence == pytest.approx(5.0)
+    expected = 5.0 + math.log((1 + math.exp(-2.0)) / 2)
+    assert model(5.0, 3.0, 1.9, -40.0).log_evidence == pytest.approx(expected)
+    assert model(5.0, 3.0, 1.9, -40.0).cloud.log_evidence == pytest.approx(expected)
+    assert math.isnan(model(math.nan, math.nan).log_evidence)
+
+
+def test_seeds_of_equal_evidence_add_their_draws() -> None:
+    assert model(5.0, 5.0).cloud.log_evidence_std ** -2 == pytest.approx(50.0)
+    assert model(5.0, -40.0).cloud.log_evidence_std ** -2 == pytest.approx(25.0)

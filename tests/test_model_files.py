@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from effect_cases import block, one_line
 
-from tpcd.effects.model import Model, load_effects, load_model, write_model
+from tpcd.effects import CATALOGUE
+from tpcd.effects.model import Model, load_candidates, load_effects, load_model, write_model
 from tpcd.errors import ModelError
 from tpcd.files import to_plain
 
@@ -125,3 +126,13 @@ def test_an_effect_may_not_come_twice_in_a_file(tmp_path: Path) -> None:
     path.write_text(block("python") + "\nEFFECTS = EFFECTS * 2\n")
     with pytest.raises(ModelError, match="holds 'wet_floor' twice"):
         load_effects(path)
+
+
+def test_candidates_have_names_of_their_own(tmp_path: Path) -> None:
+    path, other = tmp_path / "own.py", tmp_path / "other.py"
+    path.write_text(block("python"))
+    other.write_text(block("python").replace('"wet_floor"', '"floor_tilt"'))
+    assert [effect.name for effect in load_candidates([path], CATALOGUE)] == ["wet_floor"]
+    for files in ([path, path], [other]):
+        with pytest.raises(ModelError, match=r"holds an effect '.*', of which there is one"):
+            load_candidates(files, CATALOGUE)

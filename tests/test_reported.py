@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -12,8 +14,8 @@ from tpcd.belief.settings import SamplerSettings
 from tpcd.discrepancy import conclude
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import Question, posterior
-from tpcd.discrepancy.settings import DiagnosisSettings
+from tpcd.discrepancy.fit import Fit, Question, posterior
+from tpcd.discrepancy.settings import REPORTED_SEEDS, DiagnosisSettings
 from tpcd.discrepancy.workbench import Workbench
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
@@ -53,10 +55,14 @@ def bench() -> Workbench:
     return Workbench(question, settings, coverage_of([episode]), 0, lambda line: None)
 
 
-def test_reported_intervals_are_wider_and_hold_the_same_place(bench: Workbench) -> None:
+def test_reported_intervals_are_wider_and_hold_the_same_place(
+    bench: Workbench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fit = fit_model(bench.question, (), range(6))
     # Fewer seeds have too few draws for a width.
-    own, told = posterior(bench.question, fit), conclude._reported(bench, fit, range(40, 46))
+    monkeypatch.setattr(conclude, "ENOUGH_DRAWS", 1e9)
+    told = conclude._reported(bench, bench.question, fit, range(40, 46))
+    own = posterior(bench.question, fit)
     wider = (told.std() / own.std()).log().mean().exp()
     # 1 / sqrt(0.6) = 1.29, and less where the prior bounds or carries it: 1.12 to 1.20 for six
     # sets of seeds; a quarter of the draws leave it between 1.00 and 1.30.
@@ -73,6 +79,32 @@ def test_a_last_fit_that_fails_leaves_the_narrow_one_and_says_so(
 
     fit = fit_model(bench.question, (), (0,))
     monkeypatch.setattr(conclude, "fit_model", broken)
-    found = conclude._reported(bench, fit, conclude.SEEDS)
+    found = conclude._reported(bench, bench.question, fit, REPORTED_SEEDS)
     torch.testing.assert_close(found.mean(), posterior(bench.question, fit).mean())
-    assert "intervals are too narrow: ValueError in the last fit: no draw at all" in bench.notes
+    note = "intervals are too narrow, the last fit failed: ValueError: no draw at all"
+    assert bench.notes == [note]
+
+
+@pytest.mark.parametrize(
+    ("draws", "used", "warned"),
+    [([30, 30, 1], 2, False), ([9, 9, 9, 9], 4, False), ([1] * 4, 4, True)],
+)
+def test_a_posterior_is_drawn_on_further_seeds_while_few_draws_count(
+    draws: list[float], used: int, warned: bool, bench: Workbench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So many on each seed; seeds of equal evidence add up."""
+    fit = fit_model(bench.question, (), (0,))
+    asked: list[int] = []
+
+    def fitted(question: Question, effects, seeds: tuple[int], *, power: float, **_: object) -> Fit:
+        assert power == conclude.POWER
+        asked.extend(seeds)
+        cloud = replace(fit.clouds[0], log_evidence_std=draws[len(asked) - 1] ** -0.5)
+        return replace(fit, clouds=(cloud,))
+
+    bench.notes.clear()
+    monkeypatch.setattr(conclude, "fit_model", fitted)
+    belief = conclude._reported(bench, bench.question, fit, REPORTED_SEEDS)
+    assert asked == list(REPORTED_SEEDS[:used])
+    assert belief.log_evidence_std**-2 == pytest.approx(sum(draws[:used]))
+    assert any("rests on about" in note for note in bench.notes) == warned

@@ -214,7 +214,7 @@ def test_what_comes_close_is_told(
     stand.evidence, stand.looks = {(FIELD.name,): 100.0 + lead}, {(FIELD.name,): 100.0 + lead}
     found = stand.ask((WALL.name,))
     assert (found.best or found.base).names == (best.name,)
-    assert [one.names for one in found.close] == ([(close.name,)] if close else [])
+    assert [one.fit.names for one in found.close] == ([(close.name,)] if close else [])
 
 
 def test_a_formula_that_leaves_something_takes_the_place_of_nothing_that_does_not(

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 
+import tpcd
 from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
 from tpcd.data.episode import Episode
@@ -55,12 +56,11 @@ def open_diagnosis(
 
 
 def fits_of(folder: Path, code: Sequence[Path]) -> Memory:
-    """The fits of a run; those made by other code, that of the files
-    `code` included, do not count."""
-    own = versions()
-    texts = (path.read_text(encoding="utf-8") for path in code)
-    salt = digest(own["tpcd"], own["git"], *texts)
-    return Memory(folder / FITS_FOLDER, salt)
+    """The fits of a run; those made by other code, that of the files `code` and of other packages
+    included, do not count."""
+    own = sorted(Path(tpcd.__file__).parent.rglob("*.py"))
+    texts = (path.read_text(encoding="utf-8") for path in (*own, *code))
+    return Memory(folder / FITS_FOLDER, digest(versions()["packages"], *texts))
 
 
 def forget_fits(folder: Path) -> None:

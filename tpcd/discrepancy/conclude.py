@@ -9,13 +9,21 @@ from dataclasses import dataclass, replace
 from tpcd.belief.belief import Belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
+from tpcd.discrepancy.deciding import deciding_motion
 from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import Fit, posterior
-from tpcd.discrepancy.heldout import gaps, held_out_errors, prediction_errors, typical_share
+from tpcd.discrepancy.fit import Fit, Question, joined_fit, posterior
+from tpcd.discrepancy.heldout import (
+    Errors,
+    gaps,
+    held_out_errors,
+    prediction_errors,
+    typical_share,
+)
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
+from tpcd.discrepancy.settings import ENOUGH_DRAWS, FEWEST_DRAWS, REPORTED_SEEDS
 from tpcd.discrepancy.variants import NUMERICS, Variant
-from tpcd.discrepancy.workbench import Workbench
+from tpcd.discrepancy.workbench import Close, Workbench
 from tpcd.effects.formula import FORMULA_NAMES
 from tpcd.random import stream
 
@@ -25,22 +33,31 @@ POWER = 0.6
 """Power of the likelihood in the posterior that is reported. At 1 it is as narrow as a true model
 and endless draws would make it, and holds too few of the true sizes (coarsened posteriors: Miller
 and Dunson 2019); evidence, which compares models, is taken at 1."""
-SEEDS = (40, 41)
-"""Of the fits whose posterior is reported; of the model before the first is enough."""
 
 
 @dataclass(frozen=True)
 class Findings:
     """What the rounds arrived at."""
 
+    given: Fit
+    """The model as it was given,"""
+    asked: Question
+    """and what it was asked."""
     base: Fit
+    """The model without effects of its own, perhaps a variant of the one given."""
     final: Fit
     before: Adequacy
     """What the model as it was given leaves."""
     after: Adequacy
-    close: tuple[Alternative, ...] = ()
+    close: tuple[Close, ...] = ()
+    """Models that explain the data about as well as the final one."""
     variants: tuple[Variant, ...] = ()
     """Other base models that were taken instead."""
+
+    @property
+    def repairs(self) -> bool:
+        """Whether the final model has something that is named, and not only another shape."""
+        return self.final is not self.base or any(v.name in NUMERICS for v in self.variants)
 
 
 def conclude(
@@ -50,19 +67,24 @@ def conclude(
     settings = bench.settings
     gap: tuple[Gap, ...] = ()
     share = math.nan
-    if found.final is not found.base:
-        models = (found.base, found.final)
-        left = settings.adequacy and not found.after.adequate(settings.level)
-        held = [held_out_errors(bench.question, f, episodes) for f in models if left or not fresh]
-        closes = typical_share(*held) if left else math.nan
-        if left and not closes >= HALF:
+    left = settings.adequacy and not found.after.adequate(settings.level)
+    held: list[Errors] | None = None
+    if found.final is not found.base and left:
+        held = _errors(bench, [(bench.question, f) for f in (found.base, found.final)], episodes)
+        closes = math.nan if held is None else typical_share(*held)
+        if not closes >= HALF:
             found = _without_effects(bench, found, closes)
-        else:
-            shown = [prediction_errors(bench.question, f, fresh) for f in models] if fresh else held
+    if found.repairs:
+        shown = held if found.given is found.base and not fresh else None
+        if shown is None:
+            models = [(found.asked, found.given), (bench.question, found.final)]
+            shown = _errors(bench, models, episodes, fresh)
+        if shown is not None:
             channels, share = gaps(*shown, stream(settings.seed, 79))
             gap = tuple(channels)
-    first = _reported(bench, found.base, SEEDS if found.final is found.base else SEEDS[:1])
-    belief = first if found.final is found.base else _reported(bench, found.final, SEEDS)
+    belief = first = _reported(bench, bench.question, found.final, REPORTED_SEEDS)
+    if found.final is not found.given:
+        first = _reported(bench, found.asked, found.given, REPORTED_SEEDS[:1])
     effects = (
         *(NamedEffect("numerics", (), v.note) for v in found.variants if v.name in NUMERICS),
         *named_effects(belief, bench.given),
@@ -75,9 +97,9 @@ def conclude(
         verdict=verdict,
         sentence=sentence,
         effects=effects,
-        alternatives=found.close if effects else (),
+        alternatives=_alternatives(bench, found, episodes) if effects else (),
         candidates=tuple(bench.candidates),
-        log_evidence_base=found.base.log_evidence,
+        log_evidence_base=found.given.log_evidence,
         log_evidence=found.final.log_evidence,
         gap=gap,
         share_closed=share,
@@ -101,19 +123,66 @@ def conclude(
     )
 
 
-def _reported(bench: Workbench, fit: Fit, seeds: Sequence[int]) -> Belief:
-    """The posterior of a model as it is reported, wider than the one that evidence comes from."""
-    question = bench.question
-    try:
-        wide = fit_model(question, fit.effects, seeds, start=(fit,), step=fit.step, power=POWER)
-    except Exception as error:
-        bench.warn(f"intervals are too narrow: {type(error).__name__} in the last fit: {error}")
-        wide = fit
-    return replace(
-        posterior(question, wide),
-        log_evidence=fit.log_evidence,
-        log_evidence_std=fit.cloud.log_evidence_std,
-    )
+def _errors(
+    bench: Workbench,
+    models: Sequence[tuple[Question, Fit]],
+    episodes: Sequence[Episode],
+    fresh: Sequence[Episode] = (),
+) -> list[Errors] | None:
+    """Errors of models on fresh episodes, else on blocks held out; None where one fails."""
+
+    def each() -> list[Errors]:
+        if fresh:
+            return [prediction_errors(*model, fresh) for model in models]
+        return [held_out_errors(*model, episodes) for model in models]
+
+    return bench.attempt("the gap cannot be told", each)
+
+
+def _alternatives(
+    bench: Workbench, found: Findings, episodes: Sequence[Episode]
+) -> tuple[Alternative, ...]:
+    """What else explains the data, with the motion that would decide."""
+    told = []
+    for one in found.close:
+        names = " and ".join(one.fit.names)
+        motion = bench.attempt(
+            f"no motion that tells it from {names}",
+            lambda fit=one.fit: deciding_motion(bench.question, found.final, fit, episodes[0]),
+        )
+        told.append(Alternative(one.fit.names, one.gain, motion or "not told"))
+    return tuple(told)
+
+
+def _reported(bench: Workbench, question: Question, fit: Fit, seeds: Sequence[int]) -> Belief:
+    """The posterior of a model as it is reported, wider than the one that evidence comes from: on
+    two of the seeds, and on while few draws count."""
+    wide: Fit | None = None
+    for count, seed in enumerate(seeds):
+        if wide is not None and count >= 2 and _worth(wide) >= ENOUGH_DRAWS:
+            break
+        more = bench.attempt(
+            "intervals are too narrow, the last fit failed",
+            lambda seed=seed: fit_model(
+                question, fit.effects, (seed,), start=(fit,), step=fit.step, power=POWER
+            ),
+        )
+        if more is None:
+            break
+        wide = more if wide is None else joined_fit(wide, more)
+    wide = wide or fit
+    if _worth(wide) < FEWEST_DRAWS:
+        model = " and ".join(fit.names) or "the model without effects"
+        bench.warn(
+            f"the posterior of {model} rests on about {_worth(wide):.0f} draws, expected at least"
+            f" {FEWEST_DRAWS}; sizes are less sure than their intervals say"
+        )
+    return replace(posterior(question, wide), log_evidence=fit.log_evidence)
+
+
+def _worth(fit: Fit) -> float:
+    """Effective number of the draws that a posterior was chosen from."""
+    return fit.cloud.log_evidence_std**-2 if fit.cloud.log_evidence_std > 0 else math.inf
 
 
 def _without_effects(bench: Workbench, found: Findings, share: float) -> Findings:
@@ -139,13 +208,22 @@ def _verdict(
         besides = f"; besides, {told}" if told else ""
         return "unknown_remains", f"something else is missing: {where}{besides}"
     if not effects:
-        return "nothing_missing", "the model explains the data; nothing is missing"
+        return "nothing_missing", _nothing(bench)
     if found.close:
-        others = " or ".join(" + ".join(a.names) for a in found.close)
+        others = " or ".join(" + ".join(one.fit.names) for one in found.close)
         told += f"; {others} would explain the data as well"
     if any(effect.name in FORMULA_NAMES for effect in effects):
         return "formula", told
     return "ambiguous" if found.close else "named", told
+
+
+def _nothing(bench: Workbench) -> str:
+    """That nothing is missing, and what these data could not have shown."""
+    lacking = [e.name for e in bench.settings.catalogue if bench.coverage.missing(e.needs)]
+    text = "the model explains the data; nothing is missing"
+    if not lacking:
+        return text
+    return f"{text} that they show; they hardly excite {', '.join(lacking)}"
 
 
 def _shape_line(belief: Belief, variants: Sequence[Variant]) -> str:

@@ -1,9 +1,9 @@
 """How well a model explains a history: its evidence and posterior, from the prior, on some seeds.
 
-Every model is fitted in the same way and with the same budget: importance sampling of the whole
-history at once, with modes found by climbing from all over the prior. Parameters of effects are
-entries of theta like all others, so effects and shape, mount, floor, wall and friction compete
-for the same data.
+Every model is fitted in the same way: importance sampling of the whole history at once, with modes
+found by climbing from all over the prior, made again until it tells the same twice. Parameters of
+effects are entries of theta like all others, so effects and shape, mount, floor, wall and friction
+compete for the same data.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FIRST = {"flat_rounds": 0, "rough": True, "draws": 500}
 PASSES = 5
 """Times at most that draws are made again."""
 CLIMBS = 1.0
-"""Gain of log evidence with which they are,"""
+"""Change of log evidence with which they are,"""
 ENOUGH = 10
 """and effective number below which."""
 
@@ -89,15 +89,17 @@ def _fitted(
 def draw_again(
     begin: Cloud, target: Target, sampler: SamplerSettings, generator: torch.Generator
 ) -> Pool:
-    """Draws that are made again and again, each time from where the draws before lie, while that
-    explains the data better or few of them count; once where the sampler has no flat rounds."""
+    """Draws that are made again and again, each time from where the draws before lie, while their
+    evidence changes or rests on few of them; once where the sampler has no flat rounds."""
     if not sampler.flat_rounds:
         return draw_pool(begin, target, 1, sampler, generator)
     pool = draw_pool(begin, target, 1, replace(sampler, **FIRST), generator)
-    for _ in range(PASSES):
+    for count in range(PASSES):
         cloud = pool.cloud(sampler.particles, generator)
         before, pool = pool, draw_pool(cloud, target, 1, sampler, generator)
-        climbs = pool.log_evidence > before.log_evidence + CLIMBS
-        if not climbs and pool.effective_sample_size >= ENOUGH:
+        change = pool.log_evidence - before.log_evidence
+        if count == 0:
+            change = max(change, 0.0)  # the rough draws before may say too much
+        if abs(change) <= CLIMBS and pool.effective_sample_size >= ENOUGH:
             break
     return pool

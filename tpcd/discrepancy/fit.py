@@ -43,7 +43,10 @@ FIT_SAMPLER = SamplerSettings(
 )
 """Budget of one fit on one seed."""
 TIED = 8.0
-"""Seeds whose log evidence is so close to the best count alike."""
+"""Seeds whose log evidence is so close to the best count alike in the posterior."""
+MISSED = 3.0
+"""A seed whose log evidence is so far below the best one has missed what that one found, and does
+not count in the evidence: models are fitted on different numbers of seeds."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ class Fit:
 
     @property
     def log_evidence(self) -> float:
-        """Logarithm of the mean evidence of the seeds."""
+        """Logarithm of the mean evidence of the seeds that found what the best one did."""
         return _log_mean(self.by_seed)
 
     @property
@@ -140,6 +143,7 @@ def _joined(clouds: Sequence[Cloud]) -> Cloud:
     found = torch.tensor(evidence, dtype=torch.float64)
     share = (found - found.max() + TIED).clamp(-math.inf, 0.0).softmax(0)
     weights = torch.cat([s * cloud.weights for s, cloud in zip(share, clouds, strict=True)])
+    stds = torch.tensor([cloud.log_evidence_std for cloud in clouds], dtype=torch.float64)
     positions = torch.cat([cloud.positions for cloud in clouds])
     likelihood = torch.cat([cloud.log_likelihood for cloud in clouds])
     kept = weights > 1e-6
@@ -150,10 +154,14 @@ def _joined(clouds: Sequence[Cloud]) -> Cloud:
         weights=weights[kept] / weights[kept].sum(),
         log_likelihood=likelihood[kept],
         log_evidence=_log_mean(evidence),
+        log_evidence_std=float((share * stds).norm()),
         modes=torch.cat([cloud.modes for cloud in clouds]),
     )
 
 
 def _log_mean(values: Sequence[float]) -> float:
     found = torch.tensor(values, dtype=torch.float64)
-    return float(torch.logsumexp(found, 0)) - math.log(len(values))
+    kept = found[found >= found.max() - MISSED]
+    if not len(kept):  # not a number
+        return float(found.max())
+    return float(torch.logsumexp(kept, 0)) - math.log(len(kept))

@@ -11,6 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from jaxtyping import Float
+from torch import Tensor
+
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
@@ -28,12 +31,14 @@ from tpcd.discrepancy.settings import (
 )
 from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, WIDE_SHAPE, Variant
 from tpcd.discrepancy.workbench import (
+    Close,
     Round,
     Workbench,
-    alternative,
     each_of,
+    fit_well,
     fitted_again,
     looked_closer,
+    second_best,
     stands,
 )
 from tpcd.effects.protocol import Effect
@@ -41,21 +46,24 @@ from tpcd.effects.protocol import Effect
 
 def find_confusions(bench: Workbench, base: Fit) -> None:
     """Note which effects these data could not tell apart, whatever their truth is."""
-    effects = bench.excited(bench.settings.catalogue)
-    bench.confusions[:] = confusions(signatures(bench.question, base, effects))
+    found: dict[str, Float[Tensor, "k r"]] = {}
+    for effect in bench.settings.catalogue:
+        own = bench.attempt(
+            f"{effect.name} failed in the preflight",
+            lambda e=effect: signatures(bench.question, base, [e]),
+        )
+        found |= own or {}
+    bench.confusions[:] = confusions(found)
     if bench.confusions:
         pairs = ", ".join(f"{c.name} from {c.other}" for c in bench.confusions)
         bench.tell(f"preflight: these data hardly tell {pairs}")
 
 
-def name_one(
-    bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: bool, excited: bool = True
-) -> Round:
-    """Try one more effect of the pool, of those that the data excite or of the others; `adequate`
-    says whether the model so far explains all."""
+def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: bool) -> Round:
+    """Try one more effect of the pool; `adequate` says whether the model so far explains all."""
     settings, question = bench.settings, bench.question
     number = len(current.effects) - bench.given + 1
-    glances = _glances(bench, current, pool, number, adequate, excited)
+    glances = _glances(bench, current, pool, number, adequate)
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
     worth = current.log_evidence + WORTH_FITTING[adequate]
@@ -67,12 +75,15 @@ def name_one(
         return fit_model(question, effects, (0,), start=(current,), places=found)
 
     fits: list[Fit] = []
-    top = -math.inf
+    top, rise = -math.inf, 0.0
     for look in chosen:
-        if look.log_evidence < top - BEATEN:
+        # What full fits have found beyond their looks, this one may find too.
+        if look.log_evidence + rise < top - BEATEN:
             break
-        fits += each_of(bench, [look.effect], number, fitted)
-        top = max((fit.log_evidence for fit in fits), default=-math.inf)
+        for fit in each_of(bench, [look.effect], number, fitted):
+            fits.append(fit)
+            top = max(top, fit.log_evidence)
+            rise = max(rise, fit.log_evidence - look.log_evidence)
     near = [
         fitted_again(bench, fit, 1, (current,), places=places[fit.names[-1]])
         if fit.log_evidence > current.log_evidence
@@ -88,10 +99,11 @@ def name_one(
         current = base
         if better:
             # What the base model has learnt from the alternatives, they may learn from it.
-            near = [fitted_again(bench, fit, 11, (current, fit)) for fit in near[:2]]
-            near.sort(key=lambda fit: -fit.log_evidence)
+            again = [fitted_again(bench, fit, 11, (current, fit)) for fit in near[:2]]
+            near = sorted([*again, *near[2:]], key=lambda fit: -fit.log_evidence)
     lead = near[0].log_evidence - current.log_evidence if near else -math.inf
-    if UNDECIDED[adequate] < lead < CLEAR:
+    agreed = bool(near) and second_best(near[0]) >= current.log_evidence + settings.least_gain
+    if lead > UNDECIDED[adequate] and not (lead >= CLEAR and agreed):
         current, near = looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)
@@ -105,34 +117,53 @@ def name_one(
 
 def better_base(
     bench: Workbench, current: Fit, rival: Fit | None, explained: bool
-) -> tuple[Variant, Question] | None:
-    """The variant of the base model that explains the data best, if it does so better than the
-    model as it is and the `rival`, the best candidate. Another shape need only be as good as the
-    rival: an effect that is there is found beside it, and one that is not would stand for it. Only
-    the shape is asked about after an effect, since what numerics do would have shown before it, and
-    where the model has `explained` the data, which numerics would not."""
-    found: list[tuple[float, Variant, Question]] = []
+) -> tuple[Fit, tuple[Variant, Question, Fit] | None]:
+    """The model as it is, perhaps better fitted, and the variant of it that explains the data best,
+    if it does so better than the model as it is and the `rival`, the best candidate. Another shape
+    need only be as good as the rival: an effect that is there is found beside it, and one that is
+    not would stand for it. Only the shape is asked about after an effect, since what numerics do
+    would have shown before it, and where the model has `explained` the data, which numerics would
+    not. What wins on one seed has to win on two, against a model that starts from where it is."""
+    found: list[tuple[Fit, Variant, Question]] = []
     enough = rival is not None and bench.adequacy(rival).adequate(bench.settings.level)
     first = len(current.effects) == bench.given
     for variant in VARIANTS if first and not explained else (WIDE_SHAPE,):
         if enough and variant is FINER_STEPS:
             continue  # slow, and nothing is left for it to explain
         question = variant.change(bench.question)
-        try:
-            fit = fit_model(question, current.effects, (0,), start=(current,))
-        except Exception as error:  # one failure must not cost the others
-            bench.warn(f"{variant.name} failed: {type(error).__name__}: {error}")
-            continue
-        gain = fit.log_evidence - current.log_evidence
-        bench.candidates.append(Candidate(variant.name, 0, gain, fit.by_seed))
-        found.append((fit.log_evidence, variant, question))
-    if not found:
-        return None
-    evidence, variant, question = max(found, key=lambda one: one[0])
-    least = bench.settings.least_gain
+        fit = bench.attempt(
+            f"{variant.name} failed",
+            lambda q=question: fit_model(q, current.effects, (0,), start=(current,)),
+        )
+        if fit is not None:
+            found.append((fit, variant, question))
     reached = -math.inf if rival is None else rival.log_evidence
-    reached += 0.0 if variant is WIDE_SHAPE else least
-    return (variant, question) if evidence >= max(current.log_evidence + least, reached) else None
+    least = bench.settings.least_gain
+
+    def wins(fit: Fit, variant: Variant) -> bool:
+        more = 0.0 if variant is WIDE_SHAPE else least
+        return fit.log_evidence >= max(current.log_evidence + least, reached + more)
+
+    best = max(found, key=lambda one: one[0].log_evidence, default=None)
+    chosen = None
+    if best is not None and wins(*best[:2]):
+        fit, variant, question = best
+        wide = replace(bench, question=question)
+        current = fitted_again(bench, current, 12, (current, fit))
+        well = bench.attempt(
+            f"{variant.name} failed when fitted again",
+            lambda: fit_well(wide, current.effects, start=(current, fit)),
+        )
+        if well is not None and wins(well, variant):
+            chosen = variant, question, well
+    names = [variant.name for _, variant, _ in found]
+    bench.candidates[:] = [c for c in bench.candidates if c.round or c.name not in names]
+    for fit, variant, _ in found:
+        taken = chosen is not None and variant is chosen[0]
+        shown = chosen[2] if chosen is not None and taken else fit
+        gain, outcome = shown.log_evidence - current.log_evidence, "accepted" if taken else ""
+        bench.candidates.append(Candidate(variant.name, 0, gain, shown.by_seed, outcome))
+    return current, chosen
 
 
 def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
@@ -140,7 +171,12 @@ def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
     own = fit.effects[bench.given :]
     for effect in own[:-1] if but_last else own:
         less = tuple(e for e in fit.effects if e is not effect)
-        other = fit_model(bench.question, less, (0, 1), start=(fit,))
+        other = bench.attempt(
+            f"the model without {effect.name} failed",
+            lambda less=less, fit=fit: fit_model(bench.question, less, (0, 1), start=(fit,)),
+        )
+        if other is None:
+            continue
         if fit.log_evidence - other.log_evidence < bench.price((effect,)):
             bench.tell(f"{effect.name} is no longer needed")
             fit = other
@@ -153,21 +189,10 @@ def _glances(
     pool: Sequence[Effect],
     number: int,
     adequate: bool,
-    excited: bool,
 ) -> list[Glance]:
-    """A quick look at every effect that the data excite, or at the others, the best first."""
-    candidates = [effect for effect in pool if effect.name not in current.names]
-    chosen = bench.excited(candidates)
-    others = [effect for effect in candidates if effect not in chosen]
-    if excited:
-        for effect in others:
-            lacks = ", ".join(bench.coverage.missing(effect.needs))
-            outcome = f"not excited: {lacks}"
-            bench.candidates.append(Candidate(effect.name, number, math.nan, (), outcome))
-    else:
-        chosen = others
-        again = {(effect.name, number) for effect in others}
-        bench.candidates[:] = [c for c in bench.candidates if (c.name, c.round) not in again]
+    """A quick look at every effect, the best first. Also at those that the data hardly excite: what
+    an effect does to nothing it cannot gain."""
+    chosen = [effect for effect in pool if effect.name not in current.names]
     fresh = FRESH[adequate] if bench.settings.from_prior else 0
     glances = each_of(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
     return sorted(glances, key=lambda g: -g.log_evidence)
@@ -177,6 +202,8 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
     """Whether the best of the candidates is accepted, and what comes close to it."""
     best = near[0]
     accepted, reason = stands(bench, best, current, bench.price(best.effects[-1:]), number)
+    if accepted and bench.attempt(f"{best.names[-1]} failed", lambda: bench.adequacy(best)) is None:
+        accepted, reason = False, f"{reason}, what it leaves is not told"
     outcome = f"{'accepted' if accepted else 'rejected'}: {reason}"
     place = (best.names[-1], number)
     bench.candidates[:] = [
@@ -184,7 +211,7 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
     ]
     bench.tell(f"round {number}: {best.names[-1]} {outcome}")
     close = tuple(
-        alternative(fit, current)
+        Close(fit, fit.log_evidence - current.log_evidence)
         for fit in near[1:]
         if fit.log_evidence > best.log_evidence - AMBIGUOUS
     )

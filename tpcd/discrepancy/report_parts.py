@@ -104,13 +104,13 @@ def detection_limits(
             size, note = math.inf, ""
             if lacks:
                 note = f"needs {', '.join(lacks)}"
-            elif found is not None:
+            if found is not None:
                 sd = found.sd[k]
                 width = parameter.high - parameter.low
                 cost = math.log(width / (sd * math.sqrt(2 * math.pi))) if sd > 0 else math.inf
                 size = sd * math.sqrt(2 * (least_gain + max(cost, 0.0)))
                 if size > width:
-                    size, note = math.inf, "beyond its prior"
+                    size, note = math.inf, note or "beyond its prior"
             unit = parameter.shown_unit or parameter.unit
             shown = f"{size * parameter.shown_factor:.2g} {unit}" if math.isfinite(size) else "none"
             limits.append(Limit(effect.name, parameter.name, size, shown, note))

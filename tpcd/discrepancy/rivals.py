@@ -26,9 +26,9 @@ from tpcd.discrepancy.settings import (
     RIVAL_WITHIN,
 )
 from tpcd.discrepancy.workbench import (
+    Close,
     Round,
     Workbench,
-    alternative,
     each_of,
     looked_closer,
     stands,
@@ -81,18 +81,21 @@ def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round
     if fit.log_evidence - rival.price > current.log_evidence - NEARLY_OUTDONE:
         current, (fit,) = looked_closer(bench, current, [fit], RIVAL_SEEDS)
     taken, reason = stands(bench, fit, current, rival.price, _number(bench, rival))
-    if taken and explained and bench.settings.adequacy:
-        taken = bench.adequacy(fit).adequate(bench.settings.level)
-        reason += "" if taken else ", but it leaves something"
+    if taken:
+        left = bench.attempt(f"{rival.formula.name} failed", lambda: bench.adequacy(fit))
+        if left is None:
+            taken, reason = False, f"{reason}, what it leaves is not told"
+        elif explained and bench.settings.adequacy and not left.adequate(bench.settings.level):
+            taken, reason = False, f"{reason}, but it leaves something"
     for other, its in fits:
         if other is not rival:
             _note(bench, other, its, False, f"gain {its.log_evidence - current.log_evidence:.1f}")
     _note(bench, rival, fit, taken, reason)
     beyond = fit.log_evidence - current.log_evidence - rival.price
     if not taken:
-        close = (alternative(fit, rival.without),) if beyond > -AMBIGUOUS else ()
+        close = (_beside(fit, rival),) if beyond > -AMBIGUOUS else ()
         return Round(current, None, close)
-    close = (alternative(current, rival.without),) if beyond < AMBIGUOUS else ()
+    close = (_beside(current, rival),) if beyond < AMBIGUOUS else ()
     return Round(current, pruned(bench, fit), close)
 
 
@@ -115,7 +118,7 @@ def _questions(
 ) -> Iterator[tuple[Fit, list[Effect], tuple[Effect, ...]]]:
     """Models without some effects, the formulas that may stand for those, and these effects."""
     own = current.effects[bench.given :]
-    excited = [f for f in bench.excited(FORMULAS) if f.name not in current.names]
+    others = [f for f in FORMULAS if f.name not in current.names]
     sites = dict.fromkeys(effect.site for effect in own)
     together = [tuple(effect for effect in own if effect.site == site) for site in sites]
     parts = [(effect,) for effect in own] + together
@@ -123,18 +126,20 @@ def _questions(
         parts.append(own)
     for part in dict.fromkeys(parts):
         anywhere = part == own and not explained
-        formulas = [f for f in excited if anywhere or f.site == part[0].site]
+        formulas = [f for f in others if anywhere or f.site == part[0].site]
         rest = tuple(effect for effect in current.effects if effect not in part)
         if not formulas:
             continue
         if rest == base.effects:
             yield base, formulas, part
             continue
-        try:
-            yield fit_model(bench.question, rest, (0, 1), (base, current)), formulas, part
-        except Exception as error:  # a failure must not cost what was found
-            names = " and ".join(effect.name for effect in part)
-            bench.warn(f"the model without {names} failed: {type(error).__name__}: {error}")
+        names = " and ".join(effect.name for effect in part)
+        without = bench.attempt(
+            f"the model without {names} failed",
+            lambda rest=rest: fit_model(bench.question, rest, (0, 1), (base, current)),
+        )
+        if without is not None:
+            yield without, formulas, part
 
 
 def _looked_at(
@@ -156,6 +161,10 @@ def _fit_of(bench: Workbench, current: Fit, rival: _Rival):
         return rival, fit_model(bench.question, effects, (0, 1), start=start, places=places)
 
     return fitted
+
+
+def _beside(fit: Fit, rival: _Rival) -> Close:
+    return Close(fit, fit.log_evidence - rival.without.log_evidence)
 
 
 def _number(bench: Workbench, rival: _Rival) -> int:

@@ -14,26 +14,21 @@ from dataclasses import replace
 from tpcd.belief.belief import misfit_field
 from tpcd.belief.history import joined_history
 from tpcd.belief.prior import make_prior
-from tpcd.belief.resampling import effective_sample_size
 from tpcd.belief.settings import EstimatorSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import contact_rows, coverage_of
-from tpcd.discrepancy.diagnosis import Alternative, Diagnosis
-from tpcd.discrepancy.fit import TIED, Fit, Question
+from tpcd.discrepancy.diagnosis import Diagnosis
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import better_base, find_confusions, name_one, pruned
+from tpcd.discrepancy.report_parts import detection_limits
 from tpcd.discrepancy.rivals import outdone
-from tpcd.discrepancy.settings import (
-    ENOUGH_DRAWS,
-    FEWEST_DRAWS,
-    FEWEST_ROWS,
-    FINAL_SEEDS,
-    DiagnosisSettings,
-)
+from tpcd.discrepancy.settings import AMBIGUOUS, FEWEST_ROWS, DiagnosisSettings
 from tpcd.discrepancy.variants import FINER, Variant, step_halving, strained
-from tpcd.discrepancy.workbench import Round, Workbench, fit_well, fitted_again
+from tpcd.discrepancy.workbench import Close, Round, Workbench, fit_well
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
@@ -63,7 +58,9 @@ def diagnose(
     stop = _preflight(bench, episodes)
     if stop:
         tell(f"verdict: not enough information: {stop}")
-        found = Diagnosis("not_enough_information", stop, coverage=dict(bench.coverage.counts))
+        limits = detection_limits((), settings.catalogue, bench.coverage, settings.least_gain)
+        counts = dict(bench.coverage.counts)
+        found = Diagnosis("not_enough_information", stop, detection_limits=limits, coverage=counts)
     else:
         found = conclude(bench, _search(bench, tuple(effects)), episodes, fresh)
     return replace(found, seconds=time.perf_counter() - started)
@@ -118,42 +115,42 @@ def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
 
 def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     """All rounds: the catalogue; formulas in place of what it found, and beside one that is better
-    the catalogue once more; where that does not suffice, what the data hardly excite, since an
-    effect may be what keeps them from it (a rough wall, on which nothing slips); then formulas
-    beside what was found."""
+    the catalogue once more; where that does not suffice, formulas beside what was found."""
     settings = bench.settings
     base = current = fit_well(bench, effects)
     before = bench.adequacy(base)
     find_confusions(bench, base)
     _tell_adequacy(bench, "the model as it is", before)
+    given: tuple[Fit, Question] | None = None
     variants: list[Variant] = []
-    close: tuple[Alternative, ...] = ()
+    close: tuple[Close, ...] = ()
     asked: set[tuple[str, ...]] = set()
-    stages = [(settings.catalogue, True), (settings.catalogue, False), (FORMULAS, True)]
+    stages = [settings.catalogue, FORMULAS]
     stage = 0
     while stage < len(stages):
-        pool, excited = stages[stage]
+        pool = stages[stage]
         while len(current.effects) - bench.given < settings.most_effects:
             first = len(current.effects) == bench.given
-            adequate = bench.adequacy(current).adequate(0.05)
-            found = name_one(bench, current, pool, adequate, excited)
-            untried = stage == 0 and not variants
+            found = name_one(bench, current, pool, bench.adequacy(current).adequate(0.05))
             explained = _explains(bench, found.base)
-            if untried and not (explained and found.best is None and not strained(found.base)):
-                changed = _changed_base(bench, found, explained)
-                if changed is not None:
-                    variant, current = changed
-                    bare = len(current.effects) == bench.given
-                    base = current if bare else fit_well(bench, effects, start=(current,))
-                    variants.append(variant)
-                    _tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
+            if stage == 0 and not variants and _doubtful(found, explained):
+                again, better = better_base(bench, found.base, found.best, explained)
+                if better is not None:
+                    given = (base if not first else again, bench.question)
+                    base, current = _taken(bench, again, better, effects)
+                    variants.append(better[0])
+                    close = ()
                     continue
+                if again is not found.base:
+                    found = _against(bench, found, again)
             current = found.base
             if first:
                 base = current
             if found.best is None:
                 break
-            close, current = found.close, pruned(bench, found.best)
+            current = pruned(bench, found.best)
+            kept = _carried_on(bench, close, current) if current is found.best else ()
+            close = (*kept, *found.close)
         explained = _explains(bench, current)
         found_some = len(current.effects) > bench.given
         if found_some and pool is not FORMULAS and current.names not in asked:
@@ -167,53 +164,78 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         if explained:
             break
         stage += 1
-    if current is not base:
-        current = fitted_out(bench, current)
     after = bench.adequacy(current)
     _tell_adequacy(bench, "the model found", after)
-    halving = step_halving(bench.question, current)
-    bench.notes.append(
-        f"numerics: with {FINER} times the substeps 95 % of the predictions change by less than"
-        f" {halving:.2g} sd"
-    )
-    bench.tell(bench.notes[-1])
-    return Findings(base, current, before, after, tuple(close), tuple(variants))
+    halving = bench.attempt("steps cut further", lambda: step_halving(bench.question, current))
+    if halving is not None:
+        bench.notes.append(
+            f"numerics: with {FINER} times the substeps 95 % of the predictions change by less than"
+            f" {halving:.2g} sd"
+        )
+        bench.tell(bench.notes[-1])
+    given = given or (base, bench.question)
+    return Findings(*given, base, current, before, after, close, tuple(variants))
 
 
-def _changed_base(bench: Workbench, found: Round, explained: bool) -> tuple[Variant, Fit] | None:
-    """Another base model where one explains the data better than any effect, fitted well; what
-    is asked from then on is asked of it."""
-    better = better_base(bench, found.base, found.best, explained)
-    if better is None:
-        return None
-    variant, bench.question = better
-    number = len(found.base.effects) - bench.given + 1
+def _against(bench: Workbench, found: Round, base: Fit) -> Round:
+    """A round beside a base model that is fitted better, of which its best may gain too little."""
+    best = found.best
+    if best is None:
+        return Round(base)
+    gain = best.log_evidence - base.log_evidence
+    if gain >= bench.price(best.effects[-1:]):
+        return replace(found, base=base)
+    place = (best.names[-1], len(base.effects) - bench.given + 1)
+    outcome = f"rejected: gain {gain:.1f} over the model fitted again"
+    bench.candidates[:] = [
+        replace(c, outcome=outcome) if (c.name, c.round) == place else c for c in bench.candidates
+    ]
+    bench.tell(f"round {place[1]}: {place[0]} {outcome}")
+    return Round(base)
+
+
+def _doubtful(found: Round, explained: bool) -> bool:
+    """Whether another base model is asked for: where something is left, would be added, or stands
+    for what the shape prior does not know."""
+    return not explained or found.best is not None or strained(found.base)
+
+
+def _taken(
+    bench: Workbench,
+    current: Fit,
+    better: tuple[Variant, Question, Fit],
+    effects: tuple[Effect, ...],
+) -> tuple[Fit, Fit]:
+    """The base and the present model of another variant of the base model, of which all is asked
+    from then on."""
+    variant, bench.question, fit = better
+    number = len(current.effects) - bench.given + 1
     if number == 1:
         bench.glances.clear()
     bench.candidates[:] = [c for c in bench.candidates if c.round < number]
-    fit = fit_well(bench, found.base.effects, start=(found.base,))
-    return variant, pruned(bench, fit, but_last=False)
+    fit = pruned(bench, fit, but_last=False)
+    base = fit if len(fit.effects) == bench.given else fit_well(bench, effects, start=(fit,))
+    _tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
+    return base, fit
 
 
-def fitted_out(bench: Workbench, fit: Fit) -> Fit:
-    """The model found on further seeds, for the sake of honest intervals: two where few draws
-    count, and on while one finds much more than all before it, since the search is still climbing
-    then."""
-    climbs = False
-    for count, seed in enumerate(FINAL_SEEDS):
-        enough = count >= 2 or effective_sample_size(fit.cloud.weights) >= ENOUGH_DRAWS
-        if enough and not climbs:
-            break
-        best = max(fit.by_seed)
-        fit = fitted_again(bench, fit, seed, (fit,))
-        climbs = max(fit.by_seed) > best + TIED
-    draws = effective_sample_size(fit.cloud.weights)
-    if draws < FEWEST_DRAWS:
-        bench.warn(
-            f"the posterior of the model found rests on about {draws:.0f} draws, expected at least"
-            f" {FEWEST_DRAWS}; sizes are less sure than their intervals say"
+def _carried_on(bench: Workbench, close: Sequence[Close], best: Fit) -> list[Close]:
+    """What came close to a model before its last effect was added, with that effect too, where it
+    still comes close."""
+    kept, added = [], best.effects[-1]
+    for one in close:
+        own = one.fit.effects
+        if added.name in one.fit.names:
+            continue
+        fit = bench.attempt(
+            f"{' and '.join(one.fit.names)} failed beside {added.name}",
+            lambda own=own, one=one: fit_model(
+                bench.question, (*own, added), (0, 1), start=(one.fit, best)
+            ),
         )
-    return fit
+        if fit is not None and fit.log_evidence > best.log_evidence - AMBIGUOUS:
+            kept.append(Close(fit, fit.log_evidence - one.fit.log_evidence))
+    return kept
 
 
 def _explains(bench: Workbench, fit: Fit) -> bool:

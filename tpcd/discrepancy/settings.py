@@ -29,6 +29,10 @@ CLOSER = 3
 fitted again."""
 CLOSER_SEEDS = (30, 31, 32)
 """Seeds of that, of which further ones are used while the search still climbs."""
+CLIMBING = 2.0
+"""Gain of log evidence with which a search that is made again still climbs."""
+AGREED = 2.0
+"""A second seed may miss the gain that is asked for by so much."""
 UNDECIDED = {True: 2.0, False: -10.0}
 """Gain from which it does not lose clearly: where the model explains the data, and where not."""
 AMBIGUOUS = 3.0
@@ -51,10 +55,10 @@ NEARLY_OUTDONE = 5.0
 """and looked at more closely where the fit does."""
 FORMULA_COUNTS = 2
 """Effects that a formula counts for: it is as much less likely beforehand."""
-FINAL_SEEDS = tuple(range(20, 28))
-"""Further seeds of the model that was found."""
+REPORTED_SEEDS = (40, 41, 42, 43)
+"""Seeds of the fits whose posterior is reported: two, and on while few draws count."""
 ENOUGH_DRAWS = 50
-"""Effective number of draws with which none is used."""
+"""Effective number of draws with which no further seed is used."""
 FEWEST_DRAWS = 5
 """Effective number of draws below which intervals are said to be unsure."""
 

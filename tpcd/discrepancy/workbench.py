@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -9,13 +10,15 @@ from typing import TypeVar
 from torch import Tensor
 
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
-from tpcd.discrepancy.coverage import MOTIONS, Coverage
-from tpcd.discrepancy.diagnosis import Alternative, Candidate, Confusion
+from tpcd.discrepancy.coverage import Coverage
+from tpcd.discrepancy.diagnosis import Candidate, Confusion
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import TIED, Fit, Question, joined_fit
+from tpcd.discrepancy.fit import Fit, Question, joined_fit
 from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.settings import (
+    AGREED,
+    CLIMBING,
     CLOSER,
     CLOSER_SEEDS,
     FORMULA_COUNTS,
@@ -25,6 +28,7 @@ from tpcd.discrepancy.settings import (
 )
 from tpcd.effects.formula import FORMULA_NAMES
 from tpcd.effects.protocol import Effect
+from tpcd.errors import FileError
 from tpcd.random import stream
 
 Result = TypeVar("Result")
@@ -47,15 +51,13 @@ class Workbench:
     confusions: list[Confusion] = field(default_factory=list)
     tests: dict[str, float] = field(default_factory=dict)
     """What needs no theta: mean chi-square of parity and of free space, with probabilities."""
+    left: dict[str, Adequacy] = field(default_factory=dict)
+    """What models leave, by the fingerprints of question and fit."""
 
     def warn(self, line: str) -> None:
         """Note something, and say it at once."""
         self.notes.append(" ".join(line.split()))
         self.tell(f"warning: {self.notes[-1]}")
-
-    def excited(self, effects: Sequence[Effect]) -> list[Effect]:
-        """Those of the effects that the data could show."""
-        return [effect for effect in effects if not self.coverage.missing(effect.needs)]
 
     def price(self, effects: Sequence[Effect]) -> float:
         """The gain of log evidence that these have to bring."""
@@ -64,7 +66,32 @@ class Workbench:
 
     def adequacy(self, fit: Fit) -> Adequacy:
         """What a model leaves."""
-        return check_adequacy(self.question, fit, stream(self.settings.seed, 78))
+        key = self.question.fingerprint + fit.fingerprint
+        if key not in self.left:
+            generator = stream(self.settings.seed, 78)
+            self.left[key] = check_adequacy(self.question, fit, generator)
+        return self.left[key]
+
+    def attempt(self, what: str, work: Callable[[], Result]) -> Result | None:
+        """What some work on a model comes to; where it fails, a warning and None, since one model
+        must not cost the others. What is wrong with files or memory is no model's fault, and is
+        raised."""
+        try:
+            return work()
+        except (FileError, OSError, MemoryError):
+            raise
+        except Exception as error:
+            self.warn(f"{what}: {type(error).__name__}: {error}")
+            return None
+
+
+@dataclass(frozen=True)
+class Close:
+    """A model that explains the data about as well as the one that is taken."""
+
+    fit: Fit
+    gain: float
+    """Log evidence minus that of the model without its last effect."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +102,7 @@ class Round:
     """The model before, perhaps better fitted."""
     best: Fit | None = None
     """The model with one more effect, where one is accepted."""
-    close: tuple[Alternative, ...] = ()
-    """What explains the data about as well."""
+    close: tuple[Close, ...] = ()
 
 
 def fit_well(bench: Workbench, effects: Sequence[Effect], start: Sequence[Fit] = ()) -> Fit:
@@ -97,12 +123,12 @@ def fitted_again(
 ) -> Fit:
     """The fit with one more seed of its model, as for `fit_model`; as it is where that fails."""
     asked = bench.question if question is None else question
-    try:
-        return joined_fit(fit, fit_model(asked, fit.effects, (seed,), start=start, places=places))
-    except Exception as error:
-        model = ", ".join(fit.names) or "the base model"
-        bench.warn(f"{model} failed when fitted again: {type(error).__name__}: {error}")
-        return fit
+    model = ", ".join(fit.names) or "the base model"
+    again = bench.attempt(
+        f"{model} failed when fitted again",
+        lambda: fit_model(asked, fit.effects, (seed,), start=start, places=places),
+    )
+    return fit if again is None else joined_fit(fit, again)
 
 
 def looked_closer(
@@ -120,44 +146,48 @@ def looked_closer(
         before = [max(fit.by_seed) for fit in both]
         current, best = (fitted_again(bench, fit, seed, both, question=wide) for fit in both)
         near = sorted((best, *others), key=lambda fit: -fit.log_evidence)
-        if max(max(f.by_seed) - b for f, b in zip((current, best), before, strict=True)) < TIED:
+        found = (max(fit.by_seed) for fit in (current, best))
+        if max(now - then for now, then in zip(found, before, strict=True)) < CLIMBING:
             break
     return current, near
+
+
+def second_best(fit: Fit) -> float:
+    """Log evidence on the second best seed of a model, which should agree with the best."""
+    return sorted(fit.by_seed)[-2] if len(fit.by_seed) > 1 else -math.inf
 
 
 def stands(
     bench: Workbench, best: Fit, current: Fit, price: float, number: int
 ) -> tuple[bool, str]:
-    """Whether a model gains the price over another, on two seeds and, where that is not much, on
-    blocks held out; and what it gains."""
+    """Whether a model gains the price over another, nearly so on a second seed and, where that is
+    not much, on blocks held out; and what it gains."""
     gain = best.log_evidence - current.log_evidence
-    least = current.log_evidence + min(price, 0.0)
-    accepted = gain >= price and sum(evidence > least for evidence in best.by_seed) >= 2
+    second = second_best(best)
     reason = f"gain {gain:.1f}"
-    if accepted and price > 0 and gain < SURE:
+    if gain < price:
+        return False, reason
+    if second < current.log_evidence + price - AGREED:
+        return False, f"{reason}, on a second seed {second - current.log_evidence:.1f}"
+    if price <= 0 or gain >= SURE:
+        return True, reason
+
+    def bound() -> float:
         own, base = (held_out_scores(bench.question, fit) for fit in (best, current))
-        generator = stream(bench.settings.seed, 77, number)
-        bound = lower_bound(own - base, generator, VETO_LEVEL)
-        reason += f", held-out gain at least {bound:+.2f} a transition"
-        accepted = bound > 0
-    return accepted, reason
+        return lower_bound(own - base, stream(bench.settings.seed, 77, number), VETO_LEVEL)
 
-
-def alternative(fit: Fit, without: Fit) -> Alternative:
-    """A model that comes close to the one that is taken."""
-    motion = "; or ".join(MOTIONS.get(need, need) for need in fit.effects[-1].needs)
-    return Alternative(fit.names, fit.log_evidence - without.log_evidence, motion)
+    held = bench.attempt(f"{best.names[-1]} failed on blocks held out", bound)
+    if held is None:
+        return False, f"{reason}, not told on blocks held out"
+    return held > 0, f"{reason}, held-out gain at least {held:+.2f} a transition"
 
 
 def each_of(
     bench: Workbench, effects: Sequence[Effect], number: int, work: Callable[[Effect], Result]
 ) -> list[Result]:
     """Do something with every candidate; one that fails costs no other."""
-    done = []
-    for effect in effects:
-        try:
-            done.append(work(effect))
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}"
-            bench.warn(f"{effect.name} failed in round {number}: {reason}")
-    return done
+    done = (
+        bench.attempt(f"{effect.name} failed in round {number}", lambda e=effect: work(e))
+        for effect in effects
+    )
+    return [one for one in done if one is not None]

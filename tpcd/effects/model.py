@@ -195,6 +195,19 @@ def load_effects(path: Path) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
+def load_candidates(paths: Sequence[Path], known: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects of Python files, each of another name than those before it and the `known`
+    ones; raises `ModelError`."""
+    found: list[Effect] = []
+    for path in paths:
+        for effect in load_effects(path):
+            if effect.name in [one.name for one in (*known, *found)]:
+                problem = f"holds an effect {effect.name!r}, of which there is one already"
+                raise ModelError(path, problem, "give it a name of its own")
+            found.append(effect)
+    return tuple(found)
+
+
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 

@@ -32,8 +32,8 @@ ON_THE_WAY = "on the way to: "
 
 
 def deciding_motion(question: Question, fit: Fit, other: Fit, episode: Episode) -> str:
-    """The move of the diagnosis motion that tells two models apart best, and by how much each
-    time, in words."""
+    """The move of the diagnosis motion that tells two models apart best, and by how much where it
+    does so most, in words."""
     beliefs = [posterior(question, one) for one in (fit, other)]
     start, floor, wall = _stage(beliefs[0])
     plan = diagnosis_plan(start, floor, wall, episode.stiffness, STEPS, 0.0)
@@ -46,7 +46,8 @@ def deciding_motion(question: Question, fit: Fit, other: Fit, episode: Episode) 
     best = max(moves, key=lambda name: moves[name])
     if moves[best] < LEAST_NATS:
         return "no move of the diagnosis motion tells them apart"
-    return f"{best} (about {moves[best]:.2g} nats each time)"
+    digits = 0 if moves[best] >= 10 else 1
+    return f"{best} (up to {moves[best]:.{digits}f} nats each time)"
 
 
 def _stage(belief: Belief) -> tuple[Float[Tensor, " 3"], float, float]:

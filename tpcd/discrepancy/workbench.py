@@ -103,6 +103,7 @@ class Round:
     best: Fit | None = None
     """The model with one more effect, where one is accepted."""
     close: tuple[Close, ...] = ()
+    """What explains the data about as well as that."""
 
 
 def fit_well(bench: Workbench, effects: Sequence[Effect], start: Sequence[Fit] = ()) -> Fit:

@@ -92,7 +92,7 @@ class Effect(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the excitations (`discrepancy.coverage`) without which it cannot be seen."""
+        """Names of the excitations (`discrepancy.coverage`) without which it is hardly seen."""
         ...
 
     def apply(

@@ -52,16 +52,20 @@ def make_scene(
     friction: float | Tensor = 0.4,
     height: float | Tensor = 0.0,
     position: float | Tensor = 0.3,
+    compliance: float | Tensor = 0.0,
 ) -> ContactScene:
-    """Floor and wall around an outline; friction, height and position may be batched."""
-    friction, height, position = (
-        torch.as_tensor(value, dtype=torch.float64) for value in (friction, height, position)
+    """Floor and wall around an outline; numbers may be batched, the compliance with an axis for
+    the terrains."""
+    friction, height, position, compliance = (
+        torch.as_tensor(value, dtype=torch.float64)
+        for value in (friction, height, position, compliance)
     )
     batch = torch.broadcast_shapes(friction.shape, height.shape, position.shape, points.shape[:-2])
     return ContactScene(
         points_ee=points.expand(*batch, *points.shape[-2:]),
         terrains=(floor(height.expand(batch)), wall(position.expand(batch))),
         friction=friction.expand(batch)[..., None].expand(*batch, 2),
+        compliance=compliance.expand(*batch, 2),
     )
 
 

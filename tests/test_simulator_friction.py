@@ -118,15 +118,8 @@ def test_what_is_turned_in_contact_ends_where_a_fine_path_ends():
 @pytest.mark.parametrize("compliance", [1e-5, 1e-3, 5e-2])
 def test_a_soft_floor_is_a_spring_in_series_with_the_arm(engine, friction, compliance):
     """Also for the two loaded corners of a face: the terrain yields to their sum."""
-    scene = make_scene(friction=friction)
-    result = step(
-        scene,
-        vector(0, 0.05, 0),
-        vector(0, 0.01, 0),
-        engine,
-        compliance=compliance,
-        rounds=100,
-    )
+    scene = make_scene(friction=friction, compliance=compliance)
+    result = step(scene, vector(0, 0.05, 0), vector(0, 0.01, 0), engine)
     force = 0.04 / (1 / 100 + compliance)
     assert_near(result.wrench, 0, force, 0, atol=1e-5)
     assert_near(result.pose, 0, 0.05 - compliance * force, 0, atol=1e-7)
@@ -136,15 +129,8 @@ def test_a_soft_floor_is_a_spring_in_series_with_the_arm(engine, friction, compl
 def test_three_loaded_rows_on_soft_terrain_balance_springs_in_series(engine):
     """Face on the floor and edge at the wall: each terrain yields to its own load."""
     compliance = 2e-3
-    scene = make_scene(friction=0.0, position=0.05)
-    result = step(
-        scene,
-        vector(0.02, 0.05, 0),
-        vector(0.05, 0.02, 0),
-        engine,
-        compliance=compliance,
-        rounds=100,
-    )
+    scene = make_scene(friction=0.0, position=0.05, compliance=compliance)
+    result = step(scene, vector(0.02, 0.05, 0), vector(0.05, 0.02, 0), engine)
     force = 0.03 / (1 / 100 + compliance)
     assert_near(result.wrench, -force, force, 0, atol=1e-5)
     assert_near(result.pose, 0.02 + compliance * force, 0.05 - compliance * force, 0, atol=1e-7)

@@ -25,13 +25,21 @@ class ContactScene:
     """An object in the hand and the terrains around it.
 
     `points_ee` are outline points in the end-effector frame [m], `terrains` the t bodies of
-    the world, `friction` the Coulomb coefficient of the object against each of them. All
-    carry the same leading batch axes, but those of the outlines may be of length 1.
+    the world, `friction` the Coulomb coefficient of the object against each of them, and
+    `compliance` [m/N] how far each yields along its normal, as a spring; 0, and where it is left
+    out, for what is rigid. All carry the same leading batch axes, but those of the outlines may be
+    of length 1.
     """
 
     points_ee: Float[Tensor, "*#batch p 2"]
     terrains: tuple[Terrain, ...]
     friction: Float[Tensor, "*batch t"]
+    compliance: Float[Tensor, "*batch t"] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Make all terrains rigid where nothing else is said."""
+        if self.compliance is None:
+            object.__setattr__(self, "compliance", torch.zeros_like(self.friction))
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -44,6 +52,7 @@ class ContactScene:
             self.points_ee.double(),
             tuple(body.double() for body in self.terrains),
             self.friction.double(),
+            self.compliance.double(),
         )
 
     def gather(self, index: Int[Tensor, "*batch"]) -> ContactScene:
@@ -54,6 +63,7 @@ class ContactScene:
             points_ee=points.reshape(-1, *points.shape[-2:]).index_select(0, index),
             terrains=tuple(body.gather(index) for body in self.terrains),
             friction=self.friction.reshape(-1, self.friction.shape[-1])[index],
+            compliance=self.compliance.reshape(-1, self.friction.shape[-1])[index],
         )
 
     def further(self, gap: Float[Tensor, "*batch t"]) -> ContactScene:
@@ -63,7 +73,8 @@ class ContactScene:
             assert isinstance(body, HalfPlane)
             offset = body.offset - more
             planes.append(HalfPlane(body.direction.expand(*offset.shape, 2), offset))
-        return ContactScene(self.points_ee, tuple(planes), self.friction.expand(gap.shape))
+        more = (self.friction.expand(gap.shape), self.compliance.expand(gap.shape))
+        return ContactScene(self.points_ee, tuple(planes), *more)
 
     def columns(self, index: Int[Tensor, " n"]) -> ContactScene:
         """The scenes at positions `index` of the last batch axis, where it has more than one."""
@@ -75,7 +86,8 @@ class ContactScene:
         for body in self.terrains:
             assert isinstance(body, HalfPlane)
             planes.append(HalfPlane(pick(body.direction, -2), pick(body.offset, -1)))
-        return ContactScene(pick(self.points_ee, -3), tuple(planes), pick(self.friction, -2))
+        more = (pick(self.friction, -2), pick(self.compliance, -2))
+        return ContactScene(pick(self.points_ee, -3), tuple(planes), *more)
 
 
 @dataclass(frozen=True)
@@ -127,7 +139,10 @@ def column_scene(scene: ContactScene) -> ContactScene:
         assert isinstance(body, HalfPlane)
         planes.append(HalfPlane(body.direction[..., None, :], body.offset[..., None]))
     return ContactScene(
-        scene.points_ee[..., None, :, :], tuple(planes), scene.friction[..., None, :]
+        scene.points_ee[..., None, :, :],
+        tuple(planes),
+        scene.friction[..., None, :],
+        scene.compliance[..., None, :],
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,7 +54,12 @@ def compiled_filter(
         ),
         *(
             value.contiguous().numpy()
-            for value in _alike(conditions.normal, conditions.offset_seen, conditions.friction)
+            for value in _alike(
+                conditions.normal,
+                conditions.offset_seen,
+                conditions.friction,
+                conditions.compliance,
+            )
         ),
         settings.substeps,
         settings.finest,
@@ -102,14 +108,12 @@ def compiled_filter(
     )
     found = Found(*(value.numpy() for value in answers))
     points = points_ee.detach().double().mT.contiguous().numpy()
-    law = native.law_of(settings)
-    native.in_parts(
-        lambda first, last: explain_range(
-            points, law, given, measured, by_theta, found, first, last
-        ),
-        count,
-        n,
-    )
+    soft = native.yields(conditions.compliance.flatten(1)).expand(count)
+    for yielding, group in ((0, ~soft), (terrains, soft)):
+        law, which = native.law_of(settings, yielding), torch.nonzero(group).flatten().numpy()
+        explain = partial(explain_range, points, law, given, measured, by_theta, found, which)
+        if len(which):
+            native.in_parts(explain, len(which), n)
     answer = HistoryLikelihood(total, mean, covariance)
     if innovations:
         answer = replace(answer, whitened=whitened, log_scale=log_scale, slopes=slopes)

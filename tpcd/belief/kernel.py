@@ -48,22 +48,23 @@ def _compile_explain_range(stamp: int) -> Callable[..., None]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     @no_type_check
-    def explain_range(points, law, given, measured, by_theta, found, first, last):
+    def explain_range(points, law, given, measured, by_theta, found, which, first, last):
         if stamp >= 0:
-            _explain_range(points, law, given, measured, by_theta, found, first, last)
+            _explain_range(points, law, given, measured, by_theta, found, which, first, last)
 
     return explain_range
 
 
 @njit(inline="always")
 @no_type_check
-def _explain_range(points, law, given, measured, by_theta, found, first, last):
-    """Evaluate the particles from `first` up to `last`; `points` (m, 2, p) are their outlines."""
+def _explain_range(points, law, given, measured, by_theta, found, which, first, last):
+    """Evaluate the particles in `which` from `first` up to `last`; `points` (m, 2, p) are the
+    outlines of all."""
     terrains, count = given.offsets.shape[2], points.shape[2]
     steps, size = measured.used.shape[0], found.mean.shape[1]
     entries = by_theta.offsets.shape[1]
-    chains, space = new_chains(terrains, count), new_space(terrains)
-    slopes = new_slopes(terrains, entries)
+    chains, space = new_chains(terrains, count), new_space(terrains, law.room)
+    slopes = new_slopes(terrains, entries, law.room)
     poses = np.zeros((7, 3))
     answer = Answer(
         np.zeros((steps, 3)),
@@ -93,9 +94,9 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
         given.largest_turn,
         given.follow_path,
     )
-    normals, offsets, friction = new_planes(terrains)
+    normals, offsets, friction, compliance = new_planes(terrains)
     law = own_law(law)
-    for i in range(first, last):
+    for i in which[first:last]:
         found.total[i] = -np.inf
         if not math.isfinite(measured.sd[i]) or not measured.least[i] < np.inf:
             continue
@@ -114,7 +115,7 @@ def _explain_range(points, law, given, measured, by_theta, found, first, last):
             starts[k, 2] += begins
             previous[k, 2] += begins
             commands[k, 2] += ends
-        here = World(points[i : i + 1], normals, offsets, friction)
+        here = World(points[i : i + 1], normals, offsets, friction, compliance)
         _meet(here, given, i, 0)
         extent = prepare(here, 0, law, request, 0, steps, chains)
         begin(state, measured, seen, measured.sd[i])
@@ -206,6 +207,7 @@ def _meet(here, given, i, row):
         here.normals[0, t, 0] = given.normals[p, r, t, 0]
         here.normals[0, t, 1] = given.normals[p, r, t, 1]
         here.offsets[0, t], here.friction[0, t] = given.offsets[p, r, t], given.friction[p, r, t]
+        here.compliance[0, t] = given.compliance[p, r, t]
 
 
 @inner

@@ -37,7 +37,8 @@ class Given(NamedTuple):
     """What the arm is asked and what it meets, for m particles and r rows, or 1 of either.
 
     `commands` and `stiffness` (.., .., 3); `turns` (.., .., 1) the angle of the object in the
-    hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` (.., .., t).
+    hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` and
+    `compliance` (.., .., t).
     """
 
     commands: np.ndarray
@@ -46,6 +47,7 @@ class Given(NamedTuple):
     normals: np.ndarray
     offsets: np.ndarray
     friction: np.ndarray
+    compliance: np.ndarray
     substeps: int
     finest: float
     largest_turn: float

@@ -85,6 +85,8 @@ class Conditions:
     """Planes n·p = offset [m]."""
     friction: Float[Tensor, "#m #r t"]
     """Coulomb coefficients."""
+    compliance: Float[Tensor, "#m #r t"]
+    """How far each terrain yields along its normal under a load, at least 0 [m/N]."""
     give: Float[Tensor, "#m #r 3"]
     """How far floor and wall are displaced on the way to the row, with what they hold [m, m, rad];
     planes are not turned by its angle, which should stay 0."""
@@ -117,12 +119,19 @@ class Conditions:
         """Outlines and planes as a scene of batch (m, r), or (m, 1) where rows are alike."""
         offset = self.offset_seen
         each = torch.broadcast_shapes(
-            self.normal.shape[:3], offset.shape, self.friction.shape, (len(points_ee), 1, 1)
+            self.normal.shape[:3],
+            offset.shape,
+            self.friction.shape,
+            self.compliance.shape,
+            (len(points_ee), 1, 1),
         )
         normals, offsets = self.normal.expand(*each, 2), offset.expand(each)
         planes = zip(normals.unbind(2), offsets.unbind(2), strict=True)
         return ContactScene(
-            points_ee, tuple(HalfPlane(*plane) for plane in planes), self.friction.expand(each)
+            points_ee,
+            tuple(HalfPlane(*plane) for plane in planes),
+            self.friction.expand(each),
+            self.compliance.expand(each),
         )
 
 
@@ -136,6 +145,7 @@ def base_conditions(
         normal=torch.stack([p.direction for p in planes], -2)[:, None],
         offset=torch.stack([p.offset for p in planes], -1)[:, None],
         friction=scene.friction[:, None],
+        compliance=scene.compliance[:, None],
     )
 
 
@@ -152,6 +162,7 @@ def bare_conditions(commands: Float[Tensor, "r 3"], stiffness: Float[Tensor, " 3
         normal=torch.stack([plane.direction for plane in terrains], -2),
         offset=zero[..., :2],
         friction=zero[..., :2],
+        compliance=zero[..., :2],
         give=zero,
         sensor=torch.eye(3, dtype=commands.dtype)[None, None],
         bias=zero,

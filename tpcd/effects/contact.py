@@ -1,11 +1,10 @@
 """Effects on the contact law: compliance, adhesion, and what friction depends on.
 
-Under the load N that it has on rigid ground a surface would yield by c N, but as it does the arm's
-spring K eases, so that c N / (1 + c K) is where it ends. That is taken from the first pass; an
-error in a later one falls to c K times that of the one before, so c K should be less than 1 where
-there are later ones (K = 1000 N/m and 10 mm at 10 N make 1). A surface that yields carries along
-what it holds (`Conditions.give`), or a grip would be lost as the load changes. Where both surfaces
-hold the object, rigid friction leaves open how they share its load: passes need not converge.
+A floor or wall that yields along its normal is a part of the contact problem. Sideways, a grip
+would yield by c F under the force F that it holds on rigid ground, but as it does the arm's spring
+K eases, so that c F / (1 + c K) is where it ends. That is taken from the first pass; an error in a
+later one falls to c K times that of the one before, so c K should be less than 1 where there are
+later ones (K = 1000 N/m and 10 mm at 10 N make 1).
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from tpcd.effects.conditions import FLOOR, WALL, Conditions, Outcome, Rows, angle_difference
 from tpcd.effects.declare import DeclaredEffect, column
-from tpcd.effects.geometry import pose_change, sunk
+from tpcd.effects.geometry import pose_change
 from tpcd.effects.protocol import EffectParameter
 from tpcd.simulator import ContactMode
 
@@ -30,12 +29,9 @@ def _compliance(terrain: int):
     def change(
         conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
     ) -> Conditions:
-        if outcome is None:
-            return conditions
-        softness = column(values, 0)
-        rigid = 1.0 + softness * conditions.stiffness_along(conditions.normal[:, :, terrain])
-        sink = softness * outcome.load[:, :, terrain] / torch.where(outcome.first, rigid, 1.0)
-        return sunk(conditions, terrain, sink, rows, outcome)
+        more = torch.zeros(len(values), 2, dtype=values.dtype)
+        more[:, terrain] = values[:, 0]
+        return replace(conditions, compliance=conditions.compliance + more[:, None])
 
     return change
 
@@ -140,7 +136,6 @@ CONTACT_EFFECTS = (
         _compliance(FLOOR),
         "the floor yields {0}",
         needs=("floor loads",),
-        passes=1,
     ),
     DeclaredEffect(
         "wall_compliance",
@@ -149,7 +144,6 @@ CONTACT_EFFECTS = (
         _compliance(WALL),
         "the wall yields {0}",
         needs=("wall loads",),
-        passes=1,
     ),
     DeclaredEffect(
         "tangential_compliance",

@@ -90,6 +90,8 @@ def _meaningless(name: str, value: Tensor) -> Bool[Tensor, "m r"]:
     bad = ~torch.isfinite(value).flatten(2).all(-1)
     if name == "stiffness":
         bad = bad | (value <= 0).any(-1)
+    if name == "compliance":
+        bad = bad | (value < 0).any(-1)
     if name == "sensor":
         whole = torch.where(bad[..., None, None], torch.eye(3, dtype=value.dtype), value)
         bad = bad | (torch.linalg.det(whole).abs() < _LEAST_DETERMINANT)

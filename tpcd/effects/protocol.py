@@ -199,7 +199,7 @@ def _check_some_answer(
         raise EffectError(
             effect.name,
             f"gives no usable {field} for any value of its parameters, expected finite numbers"
-            " (and a stiffness above 0)",
+            " (a stiffness above 0, a compliance of at least 0)",
             getattr(effect, "source", ""),
         )
 

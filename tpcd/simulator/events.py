@@ -43,7 +43,7 @@ def next_event(
     scene: ContactScene,
     pose: Float[Tensor, "b 3"],
     contacts: ContactSet,
-    multiplier: Float[Tensor, "b 3"],
+    multiplier: Float[Tensor, "b k"],
     response: LinearResponse,
     way: Float[Tensor, "b 3"],
 ) -> Event:

@@ -21,30 +21,33 @@ from torch import Tensor
 
 from tpcd.contact import ContactFrame, ContactScene, contact_frame
 from tpcd.planar import rotate
-from tpcd.simulator.record import ContactSet, StepSettings
+from tpcd.simulator.record import DEGREES, ContactSet, StepSettings
 
 SINGULAR = 1e-9
 """Determinant over the product of the row sums below which loaded rows count as dependent."""
+DEPENDENT = 1e-12
+"""Pivot over the largest row sum below which they do where terrains yield: little compliance makes
+rows nearly dependent."""
 
 
 @dataclass(frozen=True)
 class LinearResponse:
     """First-order change of the settled pose with start, command, gap and lever of each terrain,
-    and that of the multipliers of the three rows in the same order."""
+    and that of the multipliers of the k rows in the same order."""
 
     start: Float[Tensor, "b 3 3"]
     command: Float[Tensor, "b 3 3"]
     gap: Float[Tensor, "b t 3"]
     lever: Float[Tensor, "b t 3"]
-    load_start: Float[Tensor, "b 3 3"]
-    load_command: Float[Tensor, "b 3 3"]
-    load_gap: Float[Tensor, "b t 3"]
-    load_lever: Float[Tensor, "b t 3"]
+    load_start: Float[Tensor, "b k 3"]
+    load_command: Float[Tensor, "b k 3"]
+    load_gap: Float[Tensor, "b t k"]
+    load_lever: Float[Tensor, "b t k"]
 
 
 @dataclass(frozen=True)
 class _System:
-    """The equations at the solution: residuals, rows, and the 3 x 3 Schur complement."""
+    """The equations at the solution: residuals, k rows, and their Schur complement."""
 
     force_residual: Tensor
     row_residual: Tensor
@@ -64,7 +67,7 @@ def newton_step(
     pose: Float[Tensor, "b 3"],
     contacts: ContactSet,
     settings: StepSettings,
-) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
+) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b k"]]:
     """Pose and multipliers after one Newton step on the equations at rest."""
     system = _system(scene, start, command, stiffness, pose, contacts, settings)
     step, gain = _solve(system, -system.force_residual, -system.row_residual)
@@ -128,8 +131,9 @@ def _system(
     force = now.normal_row + slope[..., None] * now.tangent_row
     held = ~contacts.slipping if settings.friction == "coulomb" else torch.ones_like(loaded)
     drag = torch.where(held, slope, 0.0)
-    load = _same_terrain(contacts, loaded) * settings.compliance
-    row_residual = now.gap + drag * slip + (load * multiplier[..., None, :]).sum(-1)
+    soft = torch.gather(scene.compliance, -1, contacts.terrain)
+    soft = _same_terrain(contacts, loaded) * soft[..., None]
+    row_residual = now.gap + drag * slip + (soft * multiplier[..., None, :]).sum(-1)
     force_residual = stiffness * (pose - command) - (multiplier[..., None] * force).sum(-2)
     constraint = (now.normal_row + drag[..., None] * now.tangent_row).detach()
     force = force.detach()
@@ -140,7 +144,7 @@ def _system(
         constraint=constraint,
         force=force,
         inverse_stiffness=inverse_stiffness,
-        inverse_schur=_inverse_schur(constraint, force, inverse_stiffness, load, loaded),
+        inverse_schur=_inverse_schur(constraint, force, inverse_stiffness, soft.detach(), loaded),
         loaded=loaded,
         start_row=-(drag[..., None] * before.tangent_row * loaded[..., None]).detach(),
     )
@@ -156,15 +160,22 @@ def _solve(system: _System, force: Tensor, row: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _inverse_schur(
-    constraint: Tensor, force: Tensor, inverse_stiffness: Tensor, load: Tensor, loaded: Tensor
+    constraint: Tensor, force: Tensor, inverse_stiffness: Tensor, soft: Tensor, loaded: Tensor
 ) -> Tensor:
-    """Inverse of the rows' 3 x 3 Schur complement, zero where it is singular."""
+    """Inverse of the rows' Schur complement, zero where it is singular."""
     both = loaded[..., :, None] & loaded[..., None, :]
     weighted = constraint * inverse_stiffness[..., None, :]
     matrix = torch.where(
-        both, (weighted[..., :, None, :] * force[..., None, :, :]).sum(-1) + load, 0.0
+        both, (weighted[..., :, None, :] * force[..., None, :, :]).sum(-1) + soft, 0.0
     )
     matrix = matrix + torch.diag_embed((~loaded).to(matrix.dtype))
+    if matrix.shape[-1] > DEGREES:
+        factors, order, _ = torch.linalg.lu_factor_ex(matrix)
+        pivot = factors.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
+        regular = pivot > DEPENDENT * matrix.abs().sum(-1).amax(-1)
+        whole = torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix)
+        inverse = torch.linalg.lu_solve(factors, order, whole)
+        return torch.where(regular[..., None, None], inverse, 0.0)
     first, second, third = matrix.unbind(-1)
     # Rows of the adjugate are the cross products of the columns.
     adjugate = torch.stack(

@@ -57,15 +57,15 @@ def _compile_step_range(stamp: int) -> Callable[..., None]:
 def _step_range(world, law, request, answer, first, last):
     """Step the transitions from `first` up to `last`."""
     terrains, count = world.normals.shape[1], world.points.shape[2]
-    chains, space = new_chains(terrains, count), new_space(terrains)
-    slopes = new_slopes(terrains, 0)
+    chains, space = new_chains(terrains, count), new_space(terrains, law.room)
+    slopes = new_slopes(terrains, 0, law.room)
     # No entries of theta; an element of it is named by a variable, as in the likelihood, since for
     # a constant the step would be compiled once more.
     by_theta = SceneSlopes(
         np.zeros((1, 0, 2, 1)), np.zeros((1, 0, terrains)), np.zeros((1, 0, terrains))
     )
     poses = np.zeros((7, 3))
-    normals, offsets, friction = new_planes(terrains)
+    normals, offsets, friction, compliance = new_planes(terrains)
     law = own_law(law)
     b = first
     while b < last:
@@ -73,11 +73,11 @@ def _step_range(world, law, request, answer, first, last):
         o, end = request.owner[b], b + 1
         while end < last and request.owner[end] == o:
             end += 1
-        here = World(world.points[o : o + 1], normals, offsets, friction)
-        set_planes(here, world.normals, world.offsets, world.friction, request.place[b])
+        here = World(world.points[o : o + 1], normals, offsets, friction, compliance)
+        set_planes(here, world, request.place[b])
         extent = prepare(here, 0, law, request, b, end, chains)
         for element in range(b, end):
-            set_planes(here, world.normals, world.offsets, world.friction, request.place[element])
+            set_planes(here, world, request.place[element])
             set_stiffness(law, request.stiffness[element if request.stiffness.shape[0] > 1 else 0])
             step_element(
                 here, 0, chains, law, extent, request, element, answer, space, slopes, poses,

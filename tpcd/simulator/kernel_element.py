@@ -115,7 +115,7 @@ def step_element(
                     world, o, chains, law, extent, landing, part, space, pose, attempt != SLIPPING
                 )
                 load = 0.0
-                for j in range(3):
+                for j in range(len(space.room)):
                     load += space.multiplier[j]
                 if attempt == PLAIN:
                     first, most = ended, load
@@ -155,8 +155,8 @@ def step_element(
         if relaxed:
             ended = RELAXED
         if fraction == 1.0:
-            for a in range(3):
-                space.chosen[a, 0] = -1
+            for j in range(len(space.room)):
+                space.chosen[j, 0] = -1
             whole[:], theta[:] = 0.0, 0.0
             for a in range(3):
                 whole[a, a] = follows
@@ -264,7 +264,7 @@ def _contacts(world, o, pose, space, contacts, b):
     """Forces of each terrain and the arm of their point, weighted by load."""
     cosine, sine = math.cos(pose[2]), math.sin(pose[2])
     contacts[b] = 0.0
-    for j in range(3):
+    for j in range(len(space.room)):
         load = space.multiplier[j]
         if space.chosen[j, 0] < 0 or not load > 0.0:
             continue

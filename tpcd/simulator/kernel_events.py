@@ -1,8 +1,8 @@
 """Compiled search for where contact changes next on a path, and passing on to there, as in
 `events`.
 
-An event is (which, point, inverse): row 0-2 whose load comes to zero, or 3 + t where the point
-touches terrain t, and the inverse of the rate at which that load or gap falls.
+An event is (which, point, inverse): the one of k rows whose load comes to zero, or k + t where the
+point touches terrain t, and the inverse of the rate at which that load or gap falls.
 """
 
 from __future__ import annotations
@@ -28,25 +28,29 @@ def next_event(world, o, chains, law, before, command, pose, space, rate):
 
     `linear_system` must be filled for the pose. Leaves the pose's rate of change in `rate`.
     """
-    margins = space.margins
+    margins, k = space.margins, len(space.room)
+    for j in range(k):
+        space.right[j] = -space.system.violated[j]
     for a in range(3):
-        space.force[a], space.right[a] = -space.system[7, a], -space.system[8, a]
+        space.force[a] = -space.system.unbalanced[a]
     respond(space)
+    for j in range(k):
+        margins[j] = space.multiplier[j] + space.gain[j]
+        space.right[j] = 0.0
     for a in range(3):
-        margins[a] = space.multiplier[a] + space.gain[a]
-        space.force[a], space.right[a] = law.stiffness[a] * (command[a] - before[a]), 0.0
+        space.force[a] = law.stiffness[a] * (command[a] - before[a])
     respond(space)
     for a in range(3):
         rate[a] = space.change[a]
     ahead, which, point, inverse = np.inf, -1, 0, 0.0
-    for j in range(3):
+    for j in range(k):
         margin, slope = max(margins[j], 0.0), space.gain[j]
         if space.chosen[j, 0] >= 0 and slope < -SLOWEST * margin and margin < -slope * ahead:
             ahead, which, inverse = -margin / slope, j, -1.0 / slope
     turn = (math.cos(pose[2]), math.sin(pose[2]))
     for t in range(world.normals.shape[1]):
         touched = False
-        for j in range(3):
+        for j in range(k):
             touched = touched or space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t
         if touched:
             continue
@@ -57,7 +61,7 @@ def next_event(world, o, chains, law, before, command, pose, space, rate):
         across = v * world.points[o, 0, lowest] - u * world.points[o, 1, lowest]
         slope = nx * rate[0] + nz * rate[1] + across * rate[2]
         if slope < -SLOWEST * margin and margin < -slope * ahead:
-            ahead, which, point, inverse = -margin / slope, 3 + t, lowest, -1.0 / slope
+            ahead, which, point, inverse = -margin / slope, k + t, lowest, -1.0 / slope
     # What is not above zero, by rounding, changes here and now, whatever moves.
     return ahead, (which, point, inverse if ahead > 0.0 else 0.0)
 
@@ -68,31 +72,35 @@ def respond_until(world, o, law, event, pose, space, slopes):
     """Turn the response of a settling into that of the pose at the event."""
     which, point, inverse = event
     response, by_terrain, system = slopes.response, slopes.by_terrain, space.system
-    terrains, row = slopes.land_gap.shape[0], space.right
-    if which >= 3:
-        touch_row(world, o, which - 3, point, pose, row)
+    terrains, row, k = slopes.land_gap.shape[0], space.right, len(space.room)
+    if which >= k:
+        touch_row(world, o, which - k, point, pose, row)
     for c in range(3):
         by_start, by_command = 0.0, 0.0
-        for i in range(3):
-            if which >= 3:
-                by_start += row[i] * response[i, c]
-                by_command += row[i] * response[3 + i, c]
-            else:
-                by_start -= system[9 + which, i] * system[12 + i, c]
-                by_command -= system[9 + which, i] * system[i, c] * system[6, c] * law.stiffness[c]
+        if which >= k:
+            for a in range(3):
+                by_start += row[a] * response[a, c]
+                by_command += row[a] * response[3 + a, c]
+        else:
+            for i in range(k):
+                share = system.inverse[which, i]
+                by_start -= share * system.starts[i, c]
+                by_command -= share * system.rows[i, c] * system.soft[c] * law.stiffness[c]
         for a in range(3):
             response[a, c] += slopes.rate[a] * inverse * by_start
             response[3 + a, c] += slopes.rate[a] * inverse * by_command
     for t in range(terrains):
-        by_gap, by_lever = 1.0 if t == which - 3 else 0.0, 0.0
-        for i in range(3):
-            if which >= 3:
-                by_gap += row[i] * by_terrain[t, i]
-                by_lever += row[i] * by_terrain[terrains + t, i]
-            else:
+        by_gap, by_lever = 1.0 if t == which - k else 0.0, 0.0
+        if which >= k:
+            for a in range(3):
+                by_gap += row[a] * by_terrain[t, a]
+                by_lever += row[a] * by_terrain[terrains + t, a]
+        else:
+            for i in range(k):
+                share = system.inverse[which, i]
                 if space.chosen[i, 0] >= 0 and space.chosen[i, 1] == t:
-                    by_gap -= system[9 + which, i]
-                by_lever -= system[9 + which, i] * system[i, 2] * system[6, 2] * space.load[t]
+                    by_gap -= share
+                by_lever -= share * system.rows[i, 2] * system.soft[2] * space.load[t]
         for a in range(3):
             by_terrain[t, a] += slopes.rate[a] * inverse * by_gap
             by_terrain[terrains + t, a] += slopes.rate[a] * inverse * by_lever

@@ -7,7 +7,7 @@ lowest point then look at a handful of points. Directions outside of the piece f
 all points, so the answers are exact always.
 
 Arrays of the flat batch of scenes: `points` (s, 2, p) outline in the end-effector frame,
-`normals` (s, t, 2), `offsets` (s, t), `friction` (s, t).
+`normals` (s, t, 2), `offsets`, `friction` and `compliance` (s, t).
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class World(NamedTuple):
     normals: np.ndarray
     offsets: np.ndarray
     friction: np.ndarray
+    compliance: np.ndarray
 
 
 class Chains(NamedTuple):

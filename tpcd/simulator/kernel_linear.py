@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import no_type_check
 
-from tpcd.simulator.implicit import SINGULAR
+from tpcd.simulator.implicit import DEPENDENT, SINGULAR
 from tpcd.simulator.kernel_geometry import object_normal
 from tpcd.simulator.kernel_inner import inner
 
@@ -16,20 +16,19 @@ from tpcd.simulator.kernel_inner import inner
 def linear_system(world, o, law, command, pose, turn, space):
     """Residuals and matrices of the rest equations at `pose`, as in `implicit`.
 
-    Fills `system`: constraint rows 0-2, force rows 3-5, inverse stiffness 6, force residual
-    7, row residual 8, inverse of the Schur complement 9-11, start rows 12-14. False where
-    the complement is singular.
+    Fills `system`; False where the complement is singular.
     """
     system, chosen, multiplier = space.system, space.chosen, space.multiplier
+    rows, pushes, starts = system.rows, system.pushes, system.starts
     turning = 0.0
     for a in range(3):
-        system[7, a] = law.stiffness[a] * (pose[a] - command[a])
-    for j in range(3):
-        system[8, j] = 0.0
+        system.unbalanced[a] = law.stiffness[a] * (pose[a] - command[a])
+    for j in range(len(space.room)):
+        system.violated[j] = 0.0
         for a in range(3):
-            system[j, a] = 0.0
-            system[3 + j, a] = 0.0
-            system[12 + j, a] = 0.0
+            rows[j, a] = 0.0
+            pushes[j, a] = 0.0
+            starts[j, a] = 0.0
         if chosen[j, 0] < 0:
             continue
         t, k = chosen[j, 1], chosen[j, 2]
@@ -41,50 +40,93 @@ def linear_system(world, o, law, command, pose, turn, space):
         drag = 0.0 if (law.coulomb and space.slipping[j]) else slope
         slip = along + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
         gap = height + nx * pose[0] + nz * pose[1] - world.offsets[o, t]
-        system[8, j] = gap + drag * slip + law.compliance * space.load[t]
-        system[j, 0], system[j, 1] = nx + drag * nz, nz - drag * nx
-        system[j, 2] = along - drag * height
-        system[3 + j, 0], system[3 + j, 1] = nx + slope * nz, nz - slope * nx
-        system[3 + j, 2] = along - slope * height
+        system.violated[j] = gap + drag * slip + world.compliance[o, t] * space.load[t]
+        rows[j, 0], rows[j, 1] = nx + drag * nz, nz - drag * nx
+        rows[j, 2] = along - drag * height
+        pushes[j, 0], pushes[j, 1] = nx + slope * nz, nz - slope * nx
+        pushes[j, 2] = along - slope * height
         for a in range(3):
-            system[7, a] -= multiplier[j] * system[3 + j, a]
+            system.unbalanced[a] -= multiplier[j] * pushes[j, a]
         turning += multiplier[j] * (height + slope * along)
-        system[12 + j, 0], system[12 + j, 1] = -drag * nz, drag * nx
-        system[12 + j, 2] = -drag * space.place[t, k, 3]
-    system[6, 0], system[6, 1] = 1.0 / law.stiffness[0], 1.0 / law.stiffness[1]
-    system[6, 2] = 1.0 / (law.stiffness[2] + turning)
-    for j in range(3):
-        for k in range(3):
+        starts[j, 0], starts[j, 1] = -drag * nz, drag * nx
+        starts[j, 2] = -drag * space.place[t, k, 3]
+    system.soft[0], system.soft[1] = 1.0 / law.stiffness[0], 1.0 / law.stiffness[1]
+    system.soft[2] = 1.0 / (law.stiffness[2] + turning)
+    for j in range(len(space.room)):
+        for k in range(len(space.room)):
             value = 1.0 if j == k else 0.0
             if chosen[j, 0] >= 0 and chosen[k, 0] >= 0:
-                value = law.compliance if chosen[j, 1] == chosen[k, 1] else 0.0
+                value = world.compliance[o, chosen[j, 1]] if chosen[j, 1] == chosen[k, 1] else 0.0
                 for a in range(3):
-                    value += system[j, a] * system[6, a] * system[3 + k, a]
-            system[9 + j, k] = value
-    return _invert(system)
+                    value += rows[j, a] * system.soft[a] * pushes[k, a]
+            system.inverse[j, k] = value
+    if len(space.room) == 3:
+        return _invert_3(system.inverse)
+    return _invert(system.inverse, space.work)
 
 
 @inner(error_model="numpy")
 @no_type_check
-def _invert(system):
-    """Invert the 3 x 3 matrix in rows 9-11 in place; False, and zeros, where it is singular."""
-    a, b, c = system[9, 0], system[9, 1], system[9, 2]
-    d, e, f = system[10, 0], system[10, 1], system[10, 2]
-    g, h, k = system[11, 0], system[11, 1], system[11, 2]
+def _invert_3(matrix):
+    """Invert a 3 x 3 matrix in place; False, and zeros, where it is singular."""
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 0], matrix[1, 1], matrix[1, 2]
+    g, h, k = matrix[2, 0], matrix[2, 1], matrix[2, 2]
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
     determinant = a * first + b * second + c * third
     scale = (abs(a) + abs(b) + abs(c)) * (abs(d) + abs(e) + abs(f)) * (abs(g) + abs(h) + abs(k))
     if not abs(determinant) > SINGULAR * scale:
         for j in range(3):
             for i in range(3):
-                system[9 + j, i] = 0.0
+                matrix[j, i] = 0.0
         return False
     r = 1.0 / determinant
-    system[9, 0], system[9, 1], system[9, 2] = first * r, (c * h - b * k) * r, (b * f - c * e) * r
-    system[10, 0], system[10, 1] = second * r, (a * k - c * g) * r
-    system[10, 2], system[11, 0] = (c * d - a * f) * r, third * r
-    system[11, 1], system[11, 2] = (b * g - a * h) * r, (a * e - b * d) * r
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = first * r, (c * h - b * k) * r, (b * f - c * e) * r
+    matrix[1, 0], matrix[1, 1] = second * r, (a * k - c * g) * r
+    matrix[1, 2], matrix[2, 0] = (c * d - a * f) * r, third * r
+    matrix[2, 1], matrix[2, 2] = (b * g - a * h) * r, (a * e - b * d) * r
     return True
+
+
+@inner(error_model="numpy")
+@no_type_check
+def _invert(matrix, other):
+    """Invert a k x k matrix in place by elimination, with the first k rows of `other` as room for
+    the inverse; False, and zeros, where it is singular."""
+    k, largest = matrix.shape[0], 0.0
+    for j in range(k):
+        total = 0.0
+        for i in range(k):
+            total += abs(matrix[j, i])
+            other[j, i] = 1.0 if j == i else 0.0
+        largest = max(largest, total)
+    regular = True
+    for i in range(k):
+        pivot = i
+        for j in range(i + 1, k):
+            if abs(matrix[j, i]) > abs(matrix[pivot, i]):
+                pivot = j
+        if not abs(matrix[pivot, i]) > DEPENDENT * largest:
+            regular = False
+            break
+        for c in range(k):
+            matrix[i, c], matrix[pivot, c] = matrix[pivot, c], matrix[i, c]
+            other[i, c], other[pivot, c] = other[pivot, c], other[i, c]
+        inverse = 1.0 / matrix[i, i]
+        for c in range(k):
+            matrix[i, c] *= inverse
+            other[i, c] *= inverse
+        for j in range(k):
+            factor = matrix[j, i]
+            if j == i or factor == 0.0:
+                continue
+            for c in range(k):
+                matrix[j, c] -= factor * matrix[i, c]
+                other[j, c] -= factor * other[i, c]
+    for j in range(k):
+        for i in range(k):
+            matrix[j, i] = other[j, i] if regular else 0.0
+    return regular
 
 
 @inner
@@ -94,19 +136,20 @@ def respond(space):
 
     Leaves it in `change`, and the change of the multipliers in `gain`; `system` must be filled.
     """
-    system, chosen, force = space.system, space.chosen, space.force
-    m0 = m1 = m2 = 0.0
-    for j in range(3):
+    system, chosen, force, gain = space.system, space.chosen, space.force, space.gain
+    for j in range(len(space.room)):
+        gain[j] = 0.0
+    for j in range(len(space.room)):
         if chosen[j, 0] < 0:
             continue
         right = space.right[j]
         for a in range(3):
-            right -= system[j, a] * system[6, a] * force[a]
-        m0 += system[9, j] * right
-        m1 += system[10, j] * right
-        m2 += system[11, j] * right
-    space.gain[0], space.gain[1], space.gain[2] = m0, m1, m2
+            right -= system.rows[j, a] * system.soft[a] * force[a]
+        for i in range(len(space.room)):
+            gain[i] += system.inverse[i, j] * right
     for a in range(3):
         # Rows of free places are zero.
-        push = force[a] + m0 * system[3, a] + m1 * system[4, a] + m2 * system[5, a]
-        space.change[a] = system[6, a] * push
+        push = force[a]
+        for j in range(len(space.room)):
+            push += gain[j] * system.pushes[j, a]
+        space.change[a] = system.soft[a] * push

@@ -55,23 +55,26 @@ class Answer(NamedTuple):
 @no_type_check
 def new_planes(terrains):
     """Room for the planes of one transition."""
-    return np.zeros((1, terrains, 2)), np.zeros((1, terrains)), np.zeros((1, terrains))
+    flat = (1, terrains)
+    return np.zeros((1, terrains, 2)), np.zeros(flat), np.zeros(flat), np.zeros(flat)
 
 
 @inner(_nrt=True)
 @no_type_check
 def own_law(law):
     """A copy of the law whose stiffness can be set for each transition."""
-    return Law(np.ones(3), np.ones(3), law.coulomb, law.rounds, law.tolerance, law.compliance)
+    return Law(np.ones(3), np.ones(3), law.coulomb, law.rounds, law.tolerance, law.room)
 
 
 @inner
 @no_type_check
-def set_planes(here, normals, offsets, friction, place):
-    """Take over the planes at a place of (.., t, 2) and (.., t)."""
+def set_planes(here, world, place):
+    """Take over the planes at a place of the world."""
     for t in range(here.offsets.shape[1]):
-        here.normals[0, t, 0], here.normals[0, t, 1] = normals[place, t, 0], normals[place, t, 1]
-        here.offsets[0, t], here.friction[0, t] = offsets[place, t], friction[place, t]
+        here.normals[0, t, 0] = world.normals[place, t, 0]
+        here.normals[0, t, 1] = world.normals[place, t, 1]
+        here.offsets[0, t], here.friction[0, t] = world.offsets[place, t], world.friction[place, t]
+        here.compliance[0, t] = world.compliance[place, t]
 
 
 @inner(_nrt=True, error_model="numpy")
@@ -114,6 +117,7 @@ def sound(world, o, law):
     total = 0.0
     for t in range(world.normals.shape[1]):
         total += abs(world.offsets[o, t]) + abs(world.friction[o, t])
+        total += world.compliance[o, t] if world.compliance[o, t] >= 0.0 else np.inf
         total += abs(world.normals[o, t, 0]) + abs(world.normals[o, t, 1])
     for a in range(3):
         total += law.root[a] if law.stiffness[a] > 0.0 else np.inf

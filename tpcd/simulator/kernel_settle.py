@@ -2,7 +2,9 @@
 
 The same model as `settle`: in every round the lowest points of each terrain join a short list
 of candidates, the contact problem of the list is solved, and its active rows give a Newton step
-on Coulomb's law that spares most rounds of the fixed point. Nothing is allocated inside.
+on Coulomb's law that spares most rounds of the fixed point. How far a terrain has yielded is one
+more variable of that problem, in units in which its spring costs as much as that of the arm.
+Nothing is allocated inside.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from tpcd.qp.compiled import solve_whitened_3
+from tpcd.qp.compiled import solve_whitened, solve_whitened_3
 from tpcd.qp.problem import Status
 from tpcd.simulator.kernel_geometry import lowest_point, object_normal
 from tpcd.simulator.kernel_inner import inner
@@ -35,7 +37,7 @@ _SOLVED = int(Status.SOLVED)
 def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
     """Settle one element, `afresh` from the start or from `pose`; leaves pose and loaded contacts,
     returns status and residual."""
-    terrains = world.normals.shape[1]
+    terrains, system = world.normals.shape[1], space.system
     for t in range(terrains):
         if afresh:
             space.counts[t] = 0
@@ -43,8 +45,9 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
     for a in range(3):
         if afresh:
             pose[a] = start[a]
-        space.chosen[a, 0] = -1
-        space.multiplier[a] = 0.0
+    for j in range(len(space.room)):
+        space.chosen[j, 0] = -1
+        space.multiplier[j] = 0.0
     status, residual = NOT_CONVERGED, np.inf
     rounds = law.rounds if afresh else PATIENCE * law.rounds
     start_turn = (math.cos(start[2]), math.sin(start[2]))
@@ -52,10 +55,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
         turn = (math.cos(pose[2]), math.sin(pose[2]))
         _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space)
         m = _build_rows(world, o, law, command, pose, turn, space)
-        found, _ = solve_whitened_3(
-            space.rows, space.values, space.sizes, m, space.motion, space.multipliers,
-            space.slots, space.work,
-        )  # fmt: skip
+        found = _solve(m, space)
         if found != _SOLVED:
             return RELAXED, np.inf
         residual = 0.0
@@ -65,23 +65,40 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
             residual = max(residual, step) if a < 2 else residual + step * extent
             pose[a] = target
         turn = (math.cos(pose[2]), math.sin(pose[2]))
-        residual += law.compliance * _choose(world, o, law, pose, turn, space)
+        _choose(world, o, law, pose, turn, space)
         if residual <= law.tolerance:
             status = CONVERGED
             break
         if k < NEWTON_ROUNDS and linear_system(world, o, law, command, pose, turn, space):
             for a in range(3):
-                space.force[a] = -space.system[7, a]
-                space.right[a] = -space.system[8, a]
+                space.force[a] = -system.unbalanced[a]
+            for j in range(len(space.room)):
+                space.right[j] = -system.violated[j]
             respond(space)
             step = space.change
             # A step beyond what this round moved comes from a wrong guess of the contacts.
             if max(abs(step[0]), abs(step[1])) + abs(step[2]) * extent <= 2.0 * residual:
                 for a in range(3):
                     pose[a] += step[a]
-                    if space.chosen[a, 0] >= 0:
-                        space.load[space.chosen[a, 1]] += space.gain[a]
     return status, residual
+
+
+@inner(forceinline=True)
+@no_type_check
+def _solve(m, space):
+    """Solve the contact problem of the m rows that were built."""
+    if len(space.room) == 3:
+        found, _ = solve_whitened_3(
+            space.rows, space.values, space.sizes, m, space.motion, space.multipliers,
+            space.slots, space.work,
+        )  # fmt: skip
+        return found
+    n = len(space.room)
+    found, _ = solve_whitened(
+        space.rows, space.values, space.sizes, m, n, 10 * (m + n), space.motion,
+        space.multipliers, space.slots, space.work,
+    )  # fmt: skip
+    return found
 
 
 @inner
@@ -89,7 +106,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
 def may_wedge(law, space):
     """Whether two terrains load the settled element, which can press on each other through it."""
     first, second = -1, -1
-    for j in range(3):
+    for j in range(len(space.room)):
         if space.chosen[j, 0] >= 0:
             t = space.chosen[j, 1]
             if first < 0 or t == first:
@@ -163,14 +180,14 @@ def _build_rows(world, o, law, command, pose, turn, space):
         u, v = object_normal(world, o, t, turn[0], turn[1])
         gap_base = nx * pose[0] + nz * pose[1] - world.offsets[o, t]
         slip_base = nz * pose[0] - nx * pose[1]
-        sink, mu = law.compliance * space.load[t], world.friction[o, t]
+        mu, yields = world.friction[o, t], math.sqrt(world.compliance[o, t])
         for k in range(min(space.counts[t], LIST)):
             x, z = space.place[t, k, 0], space.place[t, k, 1]
             # Height and tangential position of the point over the end effector; the angle
             # moves the one by the other.
             height, along = u * x + v * z, v * x - u * z
             slip = along + slip_base - space.place[t, k, 2]
-            common = gap_base + height + sink
+            common = gap_base + height
             if law.coulomb:
                 common += mu * abs(slip)
             for s in range(2):
@@ -185,6 +202,10 @@ def _build_rows(world, o, law, command, pose, turn, space):
                 row_x, row_z, row_turn = row_x * root_x, row_z * root_z, row_turn * root_turn
                 rows[m, 0], rows[m, 1], rows[m, 2] = row_x, row_z, row_turn
                 lengths[m] = row_x * row_x + row_z * row_z + row_turn * row_turn
+                if len(space.room) > 3:
+                    for a in range(3, len(space.room)):
+                        rows[m, a] = yields if a == 3 + t else 0.0
+                    lengths[m] += yields * yields
                 space.source[m, 0], space.source[m, 1] = t, 2 * k + s
                 m += 1
     # The roots and divisions in a loop of their own, which the processor does side by side.
@@ -194,7 +215,7 @@ def _build_rows(world, o, law, command, pose, turn, space):
         sizes[r] /= lengths[r]
     for r in range(m):
         inverse = 1.0 / lengths[r]
-        for a in range(3):
+        for a in range(len(space.room)):
             rows[r, a] *= inverse
     return m
 
@@ -202,12 +223,11 @@ def _build_rows(world, o, law, command, pose, turn, space):
 @inner(forceinline=True)
 @no_type_check
 def _choose(world, o, law, pose, turn, space):
-    """Read the loaded rows off the solved problem; returns the largest change of load [N]."""
+    """Read the loaded rows off the solved problem."""
     for t in range(world.normals.shape[1]):
-        space.before[t] = space.load[t]
         space.load[t] = 0.0
     space.slid[0] = False
-    for j in range(3):
+    for j in range(len(space.room)):
         space.chosen[j, 0] = -1
         space.multiplier[j] = 0.0
         r = space.slots[j]
@@ -225,18 +245,14 @@ def _choose(world, o, law, pose, turn, space):
         )  # fmt: skip
         space.slipping[j] = abs(slip) > SLIGHT * law.tolerance
         space.slid[0] = space.slid[0] or space.slipping[j]
-    for j in range(3):
+    for j in range(len(space.room)):
         if space.chosen[j, 0] < 0:
             continue
         one_sided, held = True, False
-        for i in range(3):
+        for i in range(len(space.room)):
             if i != j and space.chosen[i, 0] >= 0 and space.chosen[i, 1] == space.chosen[j, 1]:
                 held = held or space.chosen[i, 0] == space.chosen[j, 0]
                 one_sided = one_sided and space.side[i] == space.side[j]
         # A point that is held by both its sides has not slipped; where all of a terrain's load
         # is at one edge of the friction cone, slip begins, however little it still is.
         space.slipping[j] = not held and (one_sided or space.slipping[j])
-    largest = 0.0
-    for t in range(world.normals.shape[1]):
-        largest = max(largest, abs(space.load[t] - space.before[t]))
-    return largest

@@ -22,12 +22,13 @@ GRAZING = 1e-9
 
 
 class Slopes(NamedTuple):
-    """Derivatives of one element; matrices (3, 3) by pose or command, rows (3) by the rest.
+    """Derivatives of one element; matrices (3, 3) by pose or command, rows (3) by the rest, for
+    k loaded rows at most.
 
     `whole` (3 + 2 t, 3) of the step so far by the start, then rows by gaps, then by levers;
     `kept` a copy of it; `land` (6, 3) of the first touch by start and command, `land_gap`
     (t, 3) by gaps; `response` (6, 3) of one settling by start and command, `by_terrain`
-    (2 t, 3) rows by gaps and by levers, `follow` and `yields` (3, 3) to get them with.
+    (2 t, 3) rows by gaps and by levers, `follow` (3, k) and `yields` (3, 3) to get them with.
     `theta` (d, 3) of the step so far by each entry of theta, `theta_kept` a copy of it. `rate` (3)
     of the pose with the share of the path.
     """
@@ -57,7 +58,7 @@ class SceneSlopes(NamedTuple):
 
 @inner(_nrt=True)
 @no_type_check
-def new_slopes(terrains, entries):
+def new_slopes(terrains, entries, room):
     """Room for the derivatives of one element."""
     return Slopes(
         np.zeros((3 + 2 * terrains, 3)),
@@ -66,7 +67,7 @@ def new_slopes(terrains, entries):
         np.zeros((terrains, 3)),
         np.zeros((6, 3)),
         np.zeros((2 * terrains, 3)),
-        np.zeros((3, 3)),
+        np.zeros((3, len(room))),
         np.zeros((3, 3)),
         np.zeros((entries, 3)),
         np.zeros((entries, 3)),
@@ -116,24 +117,24 @@ def settling_response(law, terrains, space, slopes):
     """
     system, chosen, follow, yields = space.system, space.chosen, slopes.follow, slopes.yields
     for a in range(3):
-        for j in range(3):
+        for j in range(len(space.room)):
             value = 0.0
-            for i in range(3):
-                value += system[3 + i, a] * system[9 + i, j]
-            follow[a, j] = system[6, a] * value
+            for i in range(len(space.room)):
+                value += system.pushes[i, a] * system.inverse[i, j]
+            follow[a, j] = system.soft[a] * value
     for a in range(3):
         for c in range(3):
-            value = system[6, a] if a == c else 0.0
+            value = system.soft[a] if a == c else 0.0
             by_start = 0.0
-            for j in range(3):
-                value -= follow[a, j] * system[j, c] * system[6, c]
-                by_start -= follow[a, j] * system[12 + j, c]
+            for j in range(len(space.room)):
+                value -= follow[a, j] * system.rows[j, c] * system.soft[c]
+                by_start -= follow[a, j] * system.starts[j, c]
             yields[a, c] = value
             slopes.response[a, c] = by_start
             slopes.response[3 + a, c] = value * law.stiffness[c]
         for t in range(terrains):
             value = 0.0
-            for j in range(3):
+            for j in range(len(space.room)):
                 if chosen[j, 0] >= 0 and chosen[j, 1] == t:
                     value -= follow[a, j]
             slopes.by_terrain[t, a] = value
@@ -194,8 +195,9 @@ def append_theta(
     turn = (math.cos(pose[2]), math.sin(pose[2]))
     for e in range(theta.shape[0]):
         for a in range(3):
-            space.force[a] = space.right[a] = 0.0
-        for j in range(3):
+            space.force[a] = 0.0
+        for j in range(len(space.room)):
+            space.right[j] = 0.0
             if space.chosen[j, 0] < 0:
                 continue
             p, t, k = space.chosen[j, 0], space.chosen[j, 1], space.chosen[j, 2]
@@ -241,10 +243,10 @@ def _pass_theta(world, o, by_theta, moved, e, event, pose, space, rate):
     which, point, inverse = event
     if which < 0:
         return
-    if which < 3:
+    if which < len(space.room):
         later = space.gain[which]
     else:
-        row, t = space.right, which - 3
+        row, t = space.right, which - len(space.room)
         touch_row(world, o, t, point, pose, row)
         u, v = object_normal(world, o, t, math.cos(pose[2]), math.sin(pose[2]))
         later = u * by_theta.points[moved, e, 0, point] + v * by_theta.points[moved, e, 1, point]

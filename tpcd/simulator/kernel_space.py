@@ -15,14 +15,36 @@ LIST = 8
 
 
 class Law(NamedTuple):
-    """What all elements share: impedance, its root, and the settings of the step."""
+    """What all elements share: impedance, its root, and the settings of the step.
+
+    `room` has as many entries as rows can carry load at once, k: the degrees of freedom, three
+    where all terrains are rigid, and where they yield three and the number of terrains. Its length
+    is a part of its type, so that loops over it are compiled for either.
+    """
 
     stiffness: np.ndarray
     root: np.ndarray
     coulomb: bool
     rounds: int
     tolerance: float
-    compliance: float
+    room: tuple[float, ...]
+
+
+class System(NamedTuple):
+    """The rest equations of the k loaded rows, as filled by `linear_system`.
+
+    `rows` (k, 3) of the constraints, `pushes` (k, 3) of their forces, `soft` (3) inverse
+    stiffness, `unbalanced` (3) and `violated` (k) residuals of the balance and of the rows,
+    `inverse` (k, k) of the Schur complement, `starts` (k, 3) how rows move with the start pose.
+    """
+
+    rows: np.ndarray
+    pushes: np.ndarray
+    soft: np.ndarray
+    unbalanced: np.ndarray
+    violated: np.ndarray
+    inverse: np.ndarray
+    starts: np.ndarray
 
 
 class Space(NamedTuple):
@@ -31,18 +53,17 @@ class Space(NamedTuple):
     Candidates of terrain t (t, LIST): `listed` who, `place` (.., 4) its coordinates in the
     end-effector frame, its tangential position at the start and the start's tangent lever.
     Rows of the contact problem, up to 2 t LIST of them: `rows`, `values`, `sizes`,
-    `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The three
-    rows that may carry load: `chosen` (3, 3) point (-1 where free), terrain and place,
-    `multiplier`, `side`, `slipping`; `slid` (1) whether one of them moved along its terrain.
-    `system` (15, 3) as filled by `linear_system`. `friction` keeps that of a jammed step while it
-    is answered without.
+    `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The k
+    rows that may carry load (`room`, as in `Law`): `chosen` (k, 3) point (-1 where free), terrain
+    and place, `multiplier`, `side`, `slipping`; `slid` (1) whether one of them moved along its
+    terrain. `friction` keeps that of a jammed step while it is answered without.
     """
 
+    room: tuple[float, ...]
     listed: np.ndarray
     counts: np.ndarray
     place: np.ndarray
     load: np.ndarray
-    before: np.ndarray
     rows: np.ndarray
     values: np.ndarray
     sizes: np.ndarray
@@ -52,7 +73,7 @@ class Space(NamedTuple):
     motion: np.ndarray
     slots: np.ndarray
     work: np.ndarray
-    system: np.ndarray
+    system: System
     chosen: np.ndarray
     multiplier: np.ndarray
     side: np.ndarray
@@ -68,34 +89,42 @@ class Space(NamedTuple):
 
 @inner(_nrt=True)
 @no_type_check
-def new_space(terrains):
-    """Room for one element at a time against so many terrains."""
-    width = 2 * terrains * LIST
+def new_space(terrains, room):
+    """Room for one element at a time against so many terrains, and for so many loaded rows."""
+    width, k = 2 * terrains * LIST, len(room)
     return Space(
+        room,
         np.zeros((terrains, LIST), np.int64),
         np.zeros(terrains, np.int64),
         np.zeros((terrains, LIST, 4)),
         np.zeros(terrains),
-        np.zeros(terrains),
-        np.empty((width, 3)),
+        np.empty((width, k)),
         np.empty(width),
         np.empty(width),
         np.empty(width),
         np.empty(width),
         np.zeros((width, 2), np.int64),
-        np.empty(3),
-        np.zeros(3, np.int64),
-        np.empty((8, 3)),
-        np.empty((15, 3)),
-        np.zeros((3, 3), np.int64),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros(3, np.bool_),
+        np.empty(k),
+        np.zeros(k, np.int64),
+        np.empty((k + 5, k)),
+        System(
+            np.empty((k, 3)),
+            np.empty((k, 3)),
+            np.empty(3),
+            np.empty(3),
+            np.empty(k),
+            np.empty((k, k)),
+            np.empty((k, 3)),
+        ),
+        np.zeros((k, 3), np.int64),
+        np.zeros(k),
+        np.zeros(k),
+        np.zeros(k, np.bool_),
         np.zeros(1, np.bool_),
         np.empty(3),
+        np.empty(k),
         np.empty(3),
-        np.empty(3),
-        np.empty(3),
-        np.empty(3),
+        np.empty(k),
+        np.empty(k),
         np.zeros(terrains),
     )

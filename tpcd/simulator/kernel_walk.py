@@ -104,7 +104,7 @@ def contact_modes(space, terrains):
     modes = 0
     for t in range(terrains):
         mode, largest = 0, 0.0
-        for j in range(3):
+        for j in range(len(space.room)):
             load = space.multiplier[j]
             if space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t and load > largest:
                 largest = load

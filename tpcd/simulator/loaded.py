@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tpcd.contact import ContactScene
 from tpcd.simulator.implicit import loaded_frames
-from tpcd.simulator.record import MAX_LOADED, ContactSet
+from tpcd.simulator.record import ContactSet
 
 _FIELDS = ("multiplier", "point", "terrain", "side", "slipping")
 SLIGHT = 10.0
@@ -24,10 +24,11 @@ def terrain_load(contacts: ContactSet, terrains: int) -> Float[Tensor, "b t"]:
     return load.scatter_add(1, contacts.terrain, contacts.multiplier)
 
 
-def no_contacts(count: int, like: Tensor) -> ContactSet:
-    """Of so many elements that nothing touches, with the dtype and device of a tensor."""
-    zeros = like.new_zeros(count, MAX_LOADED)
-    index = torch.zeros(count, MAX_LOADED, dtype=torch.long, device=like.device)
+def no_contacts(count: int, rows: int, like: Tensor) -> ContactSet:
+    """Of so many elements that nothing touches, with room for so many rows, and with the dtype and
+    device of a tensor."""
+    zeros = like.new_zeros(count, rows)
+    index = torch.zeros(count, rows, dtype=torch.long, device=like.device)
     return ContactSet(zeros, index, index.clone(), zeros.clone(), index.bool())
 
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.contact import ContactScene, place_points
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
-from tpcd.simulator.record import StepSettings, Transition
+from tpcd.simulator.record import DEGREES, StepSettings, Transition
 from tpcd.terrain import HalfPlane
 
 if TYPE_CHECKING:
@@ -147,6 +147,9 @@ def step(
 
     Outlines may broadcast against the planes of the scene and are then not repeated.
     """
+    soft = yields(scene.compliance)[owner]
+    if bool(soft.any()) and not bool(soft.all()):
+        return _in_two(scene, owner, start, previous, command, stiffness, settings, soft)
     from tpcd.simulator.kernel import step_range
     from tpcd.simulator.kernel_request import Answer
 
@@ -159,7 +162,7 @@ def step(
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
     contacts = torch.empty(count, terrains, 4, dtype=torch.float64)
-    world, law = world_of(scene), law_of(settings)
+    world, law = world_of(scene), law_of(settings, terrains if bool(soft.any()) else 0)
     request = request_of(scene, owner, start, previous, command, stiffness, settings)
     answer = Answer(
         pose.numpy(),
@@ -181,6 +184,41 @@ def step(
     )
 
 
+def yields(compliance: Float[Tensor, "*batch t"]) -> Bool[Tensor, " b"]:
+    """Of a flat batch, what any terrain yields to; a NaN is no compliance."""
+    return (compliance.reshape(-1, compliance.shape[-1]) != 0).any(-1)
+
+
+def _in_two(
+    scene: ContactScene,
+    owner: Tensor,
+    start: Tensor,
+    previous: Tensor | None,
+    command: Tensor,
+    stiffness: Tensor,
+    settings: StepSettings,
+    soft: Tensor,
+) -> Transition:
+    """What is rigid and what is not, one after the other: no answer depends on what is beside."""
+    parts = []
+    order = torch.cat([torch.nonzero(which).flatten() for which in (~soft, soft)])
+    for index in (order[: int((~soft).sum())], order[int((~soft).sum()) :]):
+        parts.append(
+            step(
+                scene,
+                owner[index],
+                start[index],
+                None if previous is None else previous[index],
+                command[index],
+                stiffness if len(stiffness) == 1 else stiffness[index],
+                settings,
+            )
+        )
+    back = order.argsort()
+    both = zip(vars(parts[0]).items(), vars(parts[1]).values(), strict=True)
+    return Transition(**{name: torch.cat((one, other))[back] for (name, one), other in both})
+
+
 def world_of(scene: ContactScene) -> World:
     """The scenes of a flat batch against half-planes, as the compiled loops read them."""
     from tpcd.simulator.kernel_geometry import World
@@ -196,11 +234,13 @@ def world_of(scene: ContactScene) -> World:
         _flat(normals, terrains, 2),
         _flat(offsets, terrains),
         _flat(scene.friction.detach(), terrains),
+        _flat(scene.compliance.detach(), terrains),
     )
 
 
-def law_of(settings: StepSettings) -> Law:
-    """Settings as the compiled loops read them; the stiffness is set for each transition."""
+def law_of(settings: StepSettings, yielding: int = 0) -> Law:
+    """Settings as the compiled loops read them, for so many terrains that may be `yielding`; the
+    stiffness is set for each transition."""
     from tpcd.simulator.kernel_space import Law
 
     return Law(
@@ -209,7 +249,7 @@ def law_of(settings: StepSettings) -> Law:
         settings.friction == "coulomb",
         settings.rounds,
         settings.tolerance,
-        settings.compliance,
+        (0.0,) * (DEGREES + yielding),
     )
 
 

@@ -1,8 +1,8 @@
 """What goes into a quasi-static step and what comes out of it.
 
 `StepSettings` are the choices of the simulator, `ContactSet` the contacts that carry load
-at the solution (at most three, as the plane has three degrees of freedom) and `Transition`
-the answer for each element of the batch.
+at the solution (at most three, as the plane has three degrees of freedom, and one more for each
+terrain where these yield) and `Transition` the answer for each element of the batch.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from typing import Literal
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-MAX_LOADED = 3
-"""Most contacts rows that can be active at once: the number of degrees of freedom."""
-
+DEGREES = 3
+"""Degrees of freedom of the object in the plane."""
 LEAST_FINEST = 1e-6
 """Shorter parts cannot be told from rounding."""
 MOST_PARTS = 100_000
@@ -74,8 +73,6 @@ class StepSettings:
     """Cap on re-linearisations of geometry and friction in one substep."""
     tolerance: float = 1e-7
     """A substep has settled when a round moves no point by more than this [m]."""
-    compliance: float = 0.0
-    """Normal compliance of every terrain [m/N]; 0 is rigid."""
 
     def __post_init__(self) -> None:
         """Refuse settings that mean nothing."""
@@ -92,26 +89,24 @@ class StepSettings:
             raise ValueError(
                 f"largest_turn is {self.largest_turn}, expected radians from {least:.1g} on"
             )
-        if not 0 <= self.compliance < math.inf or not 0 < self.tolerance < math.inf:
-            raise ValueError(
-                f"compliance {self.compliance} must be >= 0 and tolerance {self.tolerance} > 0, "
-                "both finite"
-            )
+        if not 0 < self.tolerance < math.inf:
+            raise ValueError(f"tolerance is {self.tolerance}, expected a finite number > 0")
 
 
 @dataclass(frozen=True)
 class ContactSet:
-    """The contact rows that carry load, padded to three with multiplier 0.
+    """The contact rows that carry load, padded to k with multiplier 0: three, or where terrains
+    yield three and the number of terrains.
 
     Row j says gap + side x friction x slip >= 0 for outline point `point` against terrain
     `terrain`; `slipping` tells whether the point moves along the terrain.
     """
 
-    multiplier: Float[Tensor, "*batch 3"]
-    point: Int[Tensor, "*batch 3"]
-    terrain: Int[Tensor, "*batch 3"]
-    side: Float[Tensor, "*batch 3"]
-    slipping: Bool[Tensor, "*batch 3"]
+    multiplier: Float[Tensor, "*batch k"]
+    point: Int[Tensor, "*batch k"]
+    terrain: Int[Tensor, "*batch k"]
+    side: Float[Tensor, "*batch k"]
+    slipping: Bool[Tensor, "*batch k"]
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,15 @@
 The pose x' minimises 1/2 (x' - u)^T K (x' - u) subject to, for every outline point i, every
 terrain and both sides s = +1, -1,
 
-    gap_i(x') + s mu slip_i(x') + mu sigma_i + c load >= 0,
+    gap_i(x') + s mu slip_i(x') + mu sigma_i + y >= 0,
 
 slip being the tangential motion of the point since the start of the substep. With
 sigma = 0 this is the convex friction of Anitescu (2006); sigma = |slip|, found as a fixed
-point, is Coulomb friction (De Saxce and Feng 1998). `load` is the normal force on that
-terrain and c its compliance. Each round re-linearises everything at the last solution, so
-the answer holds for the turned outline and not only for its first linearisation.
+point, is Coulomb friction (De Saxce and Feng 1998). y is how far that terrain yields, c times the
+load on it: with a compliance c it is one more variable, which costs y^2 / 2c. Then floor and wall
+share the load of what both hold, which friction alone leaves open. Each round re-linearises
+everything at the last solution, so the answer holds for the turned outline and not only for its
+first linearisation.
 
 With mu >= 1 an object that starts in penetration between two terrains can be jammed: no
 motion satisfies its rows. It is answered without friction, which is always possible and
@@ -32,11 +34,10 @@ from tpcd.simulator.loaded import (
     no_contacts,
     put_contacts,
     take_contacts,
-    terrain_load,
     with_slip,
 )
 from tpcd.simulator.lowest import lowest_points
-from tpcd.simulator.record import MAX_LOADED, ContactSet, StepSettings, StepStatus
+from tpcd.simulator.record import DEGREES, ContactSet, StepSettings, StepStatus
 
 PROBE_ANGLE = 0.02
 """Rotation [rad] whose lowest points are candidates too, so that a flat face shows both ends."""
@@ -82,8 +83,8 @@ def settle_from(
     pose = (start if sought is None else sought.pose).clone()
     residual = torch.full_like(start[:, 0], torch.inf)
     status = torch.full((count,), int(StepStatus.NOT_CONVERGED), device=device)
-    contacts = no_contacts(count, start) if sought is None else sought.contacts
-    load = start.new_zeros(count, terrains)
+    rows = DEGREES + (terrains if bool((scene.compliance != 0).any()) else 0)
+    contacts = no_contacts(count, rows, start) if sought is None else sought.contacts
     extent = scene.points_ee.norm(dim=-1).amax(-1)
     running = torch.arange(count, device=device)
     part = scene
@@ -91,21 +92,18 @@ def settle_from(
         if len(running) == 0:
             break
         loaded = take_contacts(contacts, running)
-        rows = _candidate_rows(part, start[running], pose[running], loaded, load[running], settings)
+        candidates = _candidate_rows(part, start[running], pose[running], loaded, settings)
         step, found, relaxed = _solve_rows(
-            rows, command[running] - pose[running], own(stiffness, running)
+            part, candidates, command[running] - pose[running], own(stiffness, running), rows
         )
         after = pose[running] + step
         found = with_slip(part, start[running], after, found, settings.tolerance)
         put_contacts(contacts, running, found)
-        loaded_now = terrain_load(found, terrains)
-        sinking = settings.compliance * (loaded_now - load[running]).abs().amax(-1)
-        load[running] = loaded_now
-        change = _motion(step, extent[running]) + sinking
+        change = _motion(step, extent[running])
         residual[running] = change
         settled = (change <= settings.tolerance) & ~relaxed
         if k < NEWTON_ROUNDS:
-            polished, multiplier = newton_step(
+            polished, _ = newton_step(
                 part,
                 start[running],
                 command[running],
@@ -118,8 +116,6 @@ def settle_from(
             small = _motion(polished - after, extent[running]) <= 2 * change
             trusted = ~settled & ~relaxed & small
             after = torch.where(trusted[:, None], polished, after)
-            polished_load = terrain_load(replace(found, multiplier=multiplier), terrains)
-            load[running] = torch.where(trusted[:, None], polished_load, loaded_now)
         pose[running] = after
         status[running] = torch.where(
             relaxed,
@@ -159,7 +155,6 @@ def _candidate_rows(
     start: Tensor,
     pose: Tensor,
     loaded: ContactSet,
-    load: Tensor,
     settings: StepSettings,
 ) -> _Rows:
     """Linearise gap and slip at `pose` for the points that could carry load."""
@@ -172,12 +167,11 @@ def _candidate_rows(
         friction = scene.friction[:, t, None]
         slip = ((now.points_world - before.points_world) * now.tangent).sum(-1)
         lift = friction * slip.abs() if settings.friction == "coulomb" else 0.0
-        sink = settings.compliance * load[:, t, None]
         for side in (1.0, -1.0):
             parts.append(
                 _Rows(
                     jacobian=now.normal_row + side * friction[..., None] * now.tangent_row,
-                    offset=now.gap + side * friction * slip + lift + sink,
+                    offset=now.gap + side * friction * slip + lift,
                     point=index,
                     terrain=torch.full_like(index, t),
                     side=torch.full_like(slip, side),
@@ -206,18 +200,26 @@ def _candidates(
 
 
 def _solve_rows(
-    rows: _Rows, target: Tensor, stiffness: Tensor
+    scene: ContactScene, rows: _Rows, target: Tensor, stiffness: Tensor, most: int
 ) -> tuple[Tensor, ContactSet, Tensor]:
-    """Motion to the minimum, the contacts loaded there, and which elements were relaxed."""
+    """Motion to the minimum, up to `most` rows loaded there, and which elements were relaxed."""
+    jacobian, hessian, terrains = rows.jacobian, stiffness, scene.friction.shape[-1]
+    if most > DEGREES:
+        # How far each terrain yields, in units in which its spring costs half of their square.
+        own_terrain = rows.terrain[..., None] == torch.arange(terrains, device=target.device)
+        root = scene.compliance.sqrt()[:, None, :]
+        jacobian = torch.cat((jacobian, torch.where(own_terrain, root, 0.0)), dim=-1)
+        hessian = torch.cat((hessian.expand_as(target), torch.ones_like(scene.friction)), dim=-1)
+        target = torch.cat((target, torch.zeros_like(scene.friction)), dim=-1)
     solution = solve(
         ContactQP(
-            hessian=torch.diag_embed(stiffness),
+            hessian=torch.diag_embed(hessian),
             target=target,
-            rows=rows.jacobian,
+            rows=jacobian,
             offsets=rows.offset,
         )
     )
-    multiplier, order = torch.topk(solution.multipliers, MAX_LOADED, dim=-1)
+    multiplier, order = torch.topk(solution.multipliers, most, dim=-1)
     contacts = ContactSet(
         multiplier=multiplier,
         point=rows.point.gather(1, order),
@@ -225,7 +227,8 @@ def _solve_rows(
         side=rows.side.gather(1, order),
         slipping=torch.zeros_like(order, dtype=torch.bool),
     )
-    return solution.motion, contacts, solution.status == int(Status.RELAXED)
+    motion = solution.motion[:, :DEGREES]
+    return motion, contacts, solution.status == int(Status.RELAXED)
 
 
 def _motion(step: Tensor, extent: Tensor) -> Tensor:

@@ -115,7 +115,7 @@ def needs_gradient(*tensors: Tensor) -> bool:
 def _use_native(engine: Engine, scene: ContactScene, given: tuple[Tensor, ...]) -> bool:
     bodies = [body for body in scene.terrains if isinstance(body, HalfPlane)]
     planes = [value for body in bodies for value in (body.direction, body.offset)]
-    inputs = (scene.points_ee, scene.friction, *given, *planes)
+    inputs = (scene.points_ee, scene.friction, scene.compliance, *given, *planes)
     possible = (
         scene.friction.device.type == "cpu"
         and len(bodies) == len(scene.terrains)
@@ -165,7 +165,8 @@ def _step_finite(
     stiffness: Tensor,
     settings: StepSettings,
 ) -> Transition:
-    """Step what is finite and flag the rest, which then touches no gradient of the others."""
+    """Step what is finite, rigid scenes apart from those that yield, and flag the rest, which then
+    touches no gradient of the others."""
     given = [start, command, scene.friction, *([] if previous is None else [previous])]
     with torch.no_grad():
         gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
@@ -173,17 +174,21 @@ def _step_finite(
         finite = finite & torch.isfinite(scene.points_ee).flatten(1).all(-1)
         for value in given:
             finite = finite & torch.isfinite(value).all(-1)
-    if bool(finite.all()):
+        finite = finite & ((scene.compliance >= 0) & (scene.compliance < torch.inf)).all(-1)
+        soft = native.yields(scene.compliance)
+    groups = [group for group in (finite & ~soft, finite & soft) if bool(group.any())]
+    if len(groups) == 1 and bool(groups[0].all()):
         return follow_path(scene, start, previous, command, stiffness, settings)
-    index = torch.nonzero(finite).flatten()
-    before = None if previous is None else previous[index]
-    part = follow_path(
-        scene.gather(index), start[index], before, command[index], own(stiffness, index), settings
-    )
     blank = {"mode": int(ContactMode.FREE), "status": int(StepStatus.INVALID_INPUT)}
-    whole = {}
-    for name, value in vars(part).items():
-        fill = blank.get(name, torch.inf if name == "residual" else torch.nan)
-        empty = value.new_full((len(start), *value.shape[1:]), fill)
-        whole[name] = empty.index_copy(0, index, value)
+    whole: dict[str, Tensor] = {}
+    for index in (torch.nonzero(group).flatten() for group in groups or [finite]):
+        before = None if previous is None else previous[index]
+        each = own(stiffness, index)
+        part = follow_path(
+            scene.gather(index), start[index], before, command[index], each, settings
+        )
+        for name, value in vars(part).items():
+            fill = blank.get(name, torch.inf if name == "residual" else torch.nan)
+            empty = value.new_full((len(start), *value.shape[1:]), fill)
+            whole[name] = whole.get(name, empty).index_copy(0, index, value)
     return Transition(**whole)

@@ -60,25 +60,37 @@ class MadeUp:
 
 
 @pytest.mark.parametrize(
-    ("told", "often"),
+    ("told", "kept"),
     [
-        ([(0, 90), (5, 90), (5.5, 90), (99, 90)], 3),  # until it explains no more
-        ([(0, 90), (-5, 90), (99, 90)], 2),  # or less than rough ones
-        ([(0, 90), (9, 90), (5, 90), (5.5, 90), (99, 90)], 4),  # which later ones may not
-        ([(0, 90), (0, 2), (-3, 2), (-3, 50), (99, 90)], 4),  # but on while few count
-        ([(10 * k, 50) for k in range(20)], 1 + PASSES),  # and not for ever
+        ([(0, 90), (5, 90), (5.5, 90), (99, 90)], (1, 2)),  # until it explains no more
+        ([(0, 90), (-5, 90), (99, 90)], (1,)),  # or less than rough ones
+        ([(0, 90), (9, 90), (5, 90), (5.5, 90), (99, 90)], (1,)),  # which missed what came before
+        ([(0, 90), (2, 90), (6, 90), (6.5, 90), (99, 90)], (2, 3)),  # or what comes after
+        # while few count
+        ([(0, 90), (0, 3), (0.2, 3), (0.1, 3), (0, 3), (99, 90)], (1, 2, 3, 4)),
+        ([(10 * k, 50) for k in range(20)], (PASSES,)),  # and not for ever
     ],
 )
-def test_draws_are_made_again_from_where_the_last_ones_are(
-    told: list[tuple[float, int]], often: int, monkeypatch: pytest.MonkeyPatch
+def test_draws_are_made_again_and_count_together_where_they_find_the_same(
+    told: list[tuple[float, int]], kept: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Draws `kept` are those that count in the end."""
     draws = MadeUp(told)
     monkeypatch.setattr(evidence, "draw_pool", draws.pool)
-    assert abs(again().log_evidence - told[often - 1][0]) < 1e-6
-    assert len(draws.asked) == often
+    pool = again()
+    found = torch.tensor([told[k][0] for k in kept], dtype=torch.float64)
+    assert pool.log_evidence == pytest.approx(float(found.logsumexp(0)) - math.log(len(kept)))
+    if len(kept) > 1:
+        # What passes differ by is no less in doubt than each of them alone.
+        means = found.exp()
+        least = float(means.std() / means.mean()) / math.sqrt(len(kept))
+        assert pool.log_evidence_std >= least * (1 - 1e-9)
+    assert set(pool.positions[:, 0].tolist()) == {k + 1.0 for k in kept}
     first, *others = draws.asked
-    assert first.flat_rounds == 0 and first.rough and others == [FIT_SAMPLER] * (often - 1)
-    assert all((begun == k + 1).all() for k, begun in enumerate(draws.begun[1:]))
+    assert first.flat_rounds == 0 and first.rough and others == [FIT_SAMPLER] * len(others)
+    # Each begins where those that count then are.
+    for k, begun in enumerate(draws.begun[1:], start=1):
+        assert set(begun[:, 0].tolist()) <= {float(one) for one in range(1, k + 1)}
 
 
 def test_without_flat_rounds_draws_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:

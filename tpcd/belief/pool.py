@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -67,6 +67,8 @@ class Pool:
     shares: Float[Tensor, " t"]
     """What draws with each damping were worth."""
     evaluations: int
+    passes: tuple[float, ...] = ()
+    """Log evidence by each of the pools that were joined to this one."""
 
     @property
     def effective_sample_size(self) -> float:
@@ -80,8 +82,12 @@ class Pool:
 
     @property
     def log_evidence_std(self) -> float:
-        """Its standard error, from the variance of the weights."""
+        """Its standard error, from the variance of the weights, or where pools were joined from
+        what they differ by, if that is more: draws of one pool miss the same together."""
         spread = 1.0 / self.effective_sample_size - 1.0 / len(self.log_weights)
+        if len(self.passes) > 1:
+            means = (torch.tensor(self.passes, dtype=torch.float64) - max(self.passes)).exp()
+            spread = max(spread, float(means.var() / means.mean() ** 2) / len(means))
         return math.sqrt(max(spread, 0.0))
 
     def cloud(self, particles: int, generator: torch.Generator) -> Cloud:
@@ -98,6 +104,18 @@ class Pool:
             log_evidence_std=self.log_evidence_std,
             modes=self.modes,
             shares=self.shares,
+        )
+
+    def beside(self, other: Pool) -> Pool:
+        """The draws of two pools of one target as one, each weighted by its own proposal; what the
+        next one sets out from is that of the other."""
+        return replace(
+            other,
+            positions=torch.cat((self.positions, other.positions)),
+            log_likelihood=torch.cat((self.log_likelihood, other.log_likelihood)),
+            log_weights=torch.cat((self.log_weights, other.log_weights)),
+            evaluations=self.evaluations + other.evaluations,
+            passes=(*(self.passes or (self.log_evidence,)), other.log_evidence),
         )
 
     def info(self, rounds: int, distinct: int) -> CloudInfo:

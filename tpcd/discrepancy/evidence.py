@@ -21,7 +21,7 @@ from tpcd.belief.pool import Pool
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
-from tpcd.discrepancy.fit import Fit, Question, fit_stream
+from tpcd.discrepancy.fit import MISSED, Fit, Question, fit_stream
 from tpcd.effects.protocol import Effect
 from tpcd.simulator import StepSettings
 
@@ -89,17 +89,28 @@ def _fitted(
 def draw_again(
     begin: Cloud, target: Target, sampler: SamplerSettings, generator: torch.Generator
 ) -> Pool:
-    """Draws that are made again and again, each time from where the draws before lie, while their
-    evidence changes or rests on few of them; once where the sampler has no flat rounds."""
+    """Draws that are made again and again, each time from where the draws before lie, and count
+    together where they find the same, while the evidence changes or rests on few of them; once
+    where the sampler has no flat rounds.
+
+    Draws 3 nats below those before have missed what these found, and do not count; draws 3 nats
+    above replace them.
+    """
     if not sampler.flat_rounds:
         return draw_pool(begin, target, 1, sampler, generator)
-    pool = draw_pool(begin, target, 1, replace(sampler, **FIRST), generator)
+    rough = draw_pool(begin, target, 1, replace(sampler, **FIRST), generator)
+    pool, before = rough, rough.log_evidence
     for count in range(PASSES):
         cloud = pool.cloud(sampler.particles, generator)
-        before, pool = pool, draw_pool(cloud, target, 1, sampler, generator)
-        change = pool.log_evidence - before.log_evidence
+        found = draw_pool(cloud, target, 1, sampler, generator)
+        change = found.log_evidence - before
+        if count == 0 or found.log_evidence > pool.log_evidence + MISSED:
+            pool = found  # those before were rough, or missed what these found
+        elif found.log_evidence > pool.log_evidence - MISSED:
+            pool = pool.beside(found)
+        before = found.log_evidence
         if count == 0:
-            change = max(change, 0.0)  # the rough draws before may say too much
+            change = max(change, 0.0)  # rough draws may say too much
         if abs(change) <= CLIMBS and pool.effective_sample_size >= ENOUGH:
             break
     return pool

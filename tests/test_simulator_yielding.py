@@ -9,12 +9,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from contact_scenes import STIFFNESS, make_scene, many_random_transitions, vector
+from contact_scenes import BOX, STIFFNESS, make_scene, many_random_transitions, vector
 from scipy.optimize import minimize
 from simulator_steps import ENGINES, step
 
 from tpcd.contact import ContactScene, terrain_gaps
 from tpcd.simulator import ContactMode, StepSettings, StepStatus, Transition, simulate_step
+from tpcd.terrain import HalfPlane, floor, wall
 
 ONCE = StepSettings(substeps=1)
 
@@ -187,3 +188,22 @@ def test_both_engines_end_alike_on_terrain_that_yields() -> None:
     for name in ("pose_from_start", "pose_from_gap", "pose_from_lever", "contacts"):
         off = (getattr(found, name) - getattr(other, name)).abs().flatten(1).amax(-1)
         assert float((off < 1e-3)[near].double().mean()) > 0.98
+
+
+def test_what_jams_on_rigid_terrain_is_answered_beside_terrain_that_yields() -> None:
+    """A box between a floor and two walls that are closer than it is wide: on rigid walls it jams
+    even without friction, which the compiled loops leave to torch."""
+    two, zero = torch.zeros(2, dtype=torch.float64), vector(0.0, 0.0)
+    walls = (wall(two + 0.02), HalfPlane(vector(1, 0).expand(2, 2), two - 0.02))
+    compliance = torch.zeros(2, 3, dtype=torch.float64)
+    compliance[1] = 1e-3
+    scene = ContactScene(
+        BOX.expand(2, -1, 2), (floor(zero), *walls), torch.full((2, 3), 0.5).double(), compliance
+    )
+    start, command = vector(0, 0.05, 0).expand(2, 3), vector(0, 0.04, 0).expand(2, 3)
+    found, other = (
+        simulate_step(scene, start, command, STIFFNESS, ONCE, engine=e) for e in ("native", "torch")
+    )
+    assert found.status.tolist() == other.status.tolist()
+    assert found.status.tolist() == [StepStatus.RELAXED, StepStatus.CONVERGED]
+    torch.testing.assert_close(found.pose, other.pose)

@@ -14,10 +14,12 @@ from tpcd.cli import run
 
 
 def compile_loops() -> None:
-    """Simulate two steps of contact and learn from them, by all loops that estimation needs."""
+    """Simulate two steps of contact and learn from them, by all loops that estimation needs, on
+    rigid terrain and on terrain that yields."""
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
+    from tpcd.effects.catalogue import find_effect
     from tpcd.predict import ContactPredictor
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.polygon import PolygonShape
@@ -29,11 +31,12 @@ def compile_loops() -> None:
     scene = draw_scene("mug", outline.vertices, generator)
     motion = make_motion("rich", scene, 2, generator)
     episode = record(make_truth(scene, "quasistatic"), scene, motion, 2, generator).measured
-    settings = EstimatorSettings(sampler=SamplerSettings(particles=20))
-    *_, last = estimate(episode, PolygonShape(outline), generator, settings)
-    ContactPredictor(last.belief).predict(
-        episode.poses[:-1], episode.commands[1:], previous=episode.commands[:-1]
-    )
+    for effects in ((), (find_effect("floor_compliance"),)):
+        settings = EstimatorSettings(sampler=SamplerSettings(particles=20), effects=effects)
+        *_, last = estimate(episode, PolygonShape(outline), generator, settings)
+        ContactPredictor(last.belief).predict(
+            episode.poses[:-1], episode.commands[1:], previous=episode.commands[:-1]
+        )
 
 
 @dataclass(frozen=True)

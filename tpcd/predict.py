@@ -32,8 +32,8 @@ class ContactPredictor:
     """Predicts settled pose and wrench from a belief; its answers are differentiable in u.
 
     Gradients hold the answer of the pose to a change of gap or lever fixed, with which the
-    outline misfit acts, and the contact forces that effects answer to (a floor that yields
-    counts as rigid where it is); without misfit and such effects they are exact.
+    outline misfit acts, and the contact forces that effects answer to (a grip that yields
+    sideways counts as rigid where it is); without misfit and such effects they are exact.
     """
 
     def __init__(self, belief: Belief, particles: int = 400) -> None:

@@ -252,8 +252,8 @@ def _keep(found, answer, i, k):
 explain_range = _compile_explain_range(
     source_stamp(sys.modules[__name__], kalman, kernel_filter, kernel_given, kernel_state)
 )
-"""Evaluate particles `first` up to `last`: (points, law, given, measured, by_theta, found,
-first, last).
+"""Evaluate the particles `which[first:last]`: (points, law, given, measured, by_theta, found,
+which, first, last).
 
 Fills their part of `found` in place and releases the interpreter lock meanwhile.
 """

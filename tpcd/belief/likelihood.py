@@ -12,8 +12,8 @@ This changes no decision; it spares most of the cost of bad proposals.
 Where a recording begins in free space, no particle may have the object inside of floor or
 wall there, which no transition would tell (`free_start`).
 
-Effects change the conditions of the steps. Those that answer to an outcome (a floor that
-yields under load) are solved in passes: each takes the outcome under the conditions before.
+Effects change the conditions of the steps. Those that answer to an outcome (a grip that
+yields sideways) are solved in passes: each takes the outcome under the conditions before.
 Their likelihood also holds what the readings of pose and wrench say about each other, relative
 to the same without effects.
 """

@@ -22,7 +22,7 @@ from tpcd.errors import RunError
 from tpcd.shape.checkpoint import prior_hash
 
 STATE_FILE = "state.safetensors"
-STATE_VERSION = "10"
+STATE_VERSION = "11"
 """Changes with what an estimator keeps, and with what its likelihoods mean."""
 
 

@@ -26,7 +26,7 @@ from tpcd.shape.checkpoint import load_prior, prior_hash
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 _TENSORS = ("vectors", "weights", "misfit_sd", "misfit_mean", "misfit_covariance", "stiffness")
 
 

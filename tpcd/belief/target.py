@@ -128,7 +128,8 @@ class ContactTarget:
         log_scale = torch.cat((_known(here.log_scale), parity_scale), dim=1)
         slopes, stretch = [_known(here.slopes)], []
         # Effects and the size of the misfit by differences. That contact forces, to which effects
-        # answer, change too is left out: 3 % of a standard deviation with three that yield.
+        # answer, change too is left out: with surfaces that yielded so it was 3 % of a standard
+        # deviation.
         for entry in range(scene, s):
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE

@@ -90,6 +90,7 @@ def _made_up() -> tuple[Rows, Conditions, Outcome]:
         bare,
         friction=bare.friction + 0.4,
         offset=bare.offset + 0.05,
+        compliance=bare.compliance + 1e-4,
         **{name: getattr(bare, name) + 1e-3 for name in ("load", "pull", "turn", "give", "bias")},
     )
     load = torch.tensor([[0.0, 0.0], [3.0, 0.0], [3.0, 0.0], [0.0, 2.0]], dtype=torch.float64)

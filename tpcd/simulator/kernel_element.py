@@ -15,7 +15,7 @@ from tpcd.simulator.kernel_geometry import first_touch, touching
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system
 from tpcd.simulator.kernel_request import sound, wrap
-from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, may_wedge, settle
+from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, settle
 from tpcd.simulator.kernel_slopes import (
     append_part,
     append_theta,
@@ -33,6 +33,7 @@ from tpcd.simulator.kernel_walk import (
     shorter_part,
     sticking,
 )
+from tpcd.simulator.kernel_wedge import may_wedge
 from tpcd.simulator.walk import (
     AIM,
     ALMOST,
@@ -119,7 +120,7 @@ def step_element(
                     load += space.multiplier[j]
                 if attempt == PLAIN:
                     first, most = ended, load
-                    if not may_wedge(law, space) and ended != RELAXED:
+                    if not may_wedge(world, o, law, pose, space, ended) and ended != RELAXED:
                         break
                 following = _after(attempt, first, ended, law.coulomb, load < LIGHTER * most)
                 if following == attempt:

@@ -101,21 +101,6 @@ def _solve(m, space):
     return found
 
 
-@inner
-@no_type_check
-def may_wedge(law, space):
-    """Whether two terrains load the settled element, which can press on each other through it."""
-    first, second = -1, -1
-    for j in range(len(space.room)):
-        if space.chosen[j, 0] >= 0:
-            t = space.chosen[j, 1]
-            if first < 0 or t == first:
-                first = t
-            else:
-                second = t
-    return second >= 0 and law.coulomb
-
-
 @inner(forceinline=True)
 @no_type_check
 def _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space):

@@ -185,7 +185,7 @@ def step(
 
 
 def yields(compliance: Float[Tensor, "*batch t"]) -> Bool[Tensor, " b"]:
-    """Of a flat batch, what any terrain yields to; a NaN is no compliance."""
+    """Of a flat batch, where any terrain yields, or its compliance is no number."""
     return (compliance.reshape(-1, compliance.shape[-1]) != 0).any(-1)
 
 

@@ -145,9 +145,9 @@ def _relax_jammed(
     if len(jammed) == 0:
         return
     before = None if previous is None else previous[jammed]
-    part = follow_path(
-        scene.gather(owner[jammed]),
-        pose[jammed],
+    part = _step_finite(
+        scene.gather(owner[jammed]).double(),
+        pose[jammed].double(),
         before,
         command[jammed],
         own(stiffness, jammed),

@@ -1,0 +1,99 @@
+"""Compiled test of whether what two terrains hold may rest in several ways, as in `wedge`."""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+from tpcd.simulator.kernel_geometry import object_normal
+from tpcd.simulator.kernel_inner import inner
+from tpcd.simulator.kernel_settle import CONVERGED
+from tpcd.simulator.wedge import SINGLE
+
+
+@inner
+@no_type_check
+def may_wedge(world, o, law, pose, space, ended):
+    """Whether two terrains load the element, settled with the status `ended`, such that it may
+    rest elsewhere too."""
+    chosen, first, second, alone = space.chosen, -1, -1, True
+    for j in range(len(space.room)):
+        if chosen[j, 0] < 0:
+            continue
+        if first < 0:
+            first = j
+        elif chosen[j, 1] == chosen[first, 1]:
+            alone = alone and chosen[j, 0] == chosen[first, 0]
+        elif second < 0:
+            second = j
+        else:
+            same = chosen[j, 1] == chosen[second, 1] and chosen[j, 0] == chosen[second, 0]
+            alone = alone and same
+    if second < 0 or not law.coulomb:
+        return False
+    alone = alone and ended == CONVERGED
+    return not (alone and _rests_one_way(world, o, law, pose, space, first, second))
+
+
+@inner(error_model="numpy")
+@no_type_check
+def _rests_one_way(world, o, law, pose, space, first, second):
+    """Whether loads and slips of two contact points follow from any command in one way."""
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    a, b = _rows(world, o, space, first, cosine, sine), _rows(world, o, space, second, cosine, sine)
+    t, s = space.chosen[first, 1], space.chosen[second, 1]
+    rough_a, rough_b = world.friction[o, t], world.friction[o, s]
+    give_a = _product(law, a[0], a[0]) + world.compliance[o, t]
+    give_b = _product(law, b[0], b[0]) + world.compliance[o, s]
+    drag_a, drag_b = _product(law, a[0], a[1]), _product(law, b[0], b[1])
+    if not rough_a * abs(drag_a) < SINGLE * give_a or not rough_b * abs(drag_b) < SINGLE * give_b:
+        return False
+    both, by_a, by_b = (
+        _product(law, a[0], b[0]),
+        _product(law, b[0], a[1]),
+        _product(law, a[0], b[1]),
+    )
+    for i in range(4):
+        slip_a, slip_b = rough_a * (1.0 - 2.0 * (i % 2)), rough_b * (1.0 - 2.0 * (i // 2))
+        crossed = (both + slip_a * by_a) * (both + slip_b * by_b)
+        if not crossed < SINGLE * (give_a + slip_a * drag_a) * (give_b + slip_b * drag_b):
+            return False
+    along_a, along_b = _product(law, a[1], a[1]), _product(law, b[1], b[1])
+    across = _product(law, a[1], b[1])
+    return _slips_one_way(
+        rough_b, give_a, drag_a, along_a, give_b, drag_b, both, by_a, by_b, across
+    ) and _slips_one_way(rough_a, give_b, drag_b, along_b, give_a, drag_a, both, by_b, by_a, across)
+
+
+@inner(error_model="numpy")
+@no_type_check
+def _slips_one_way(rough, give_i, drag_i, along_i, give, drag, both, by_i, by, across):
+    """Whether a contact slips in one way while the other one, i, sticks: its own numbers without
+    what it shares with normal and tangent of i."""
+    size = give_i * along_i - drag_i * drag_i
+    normal = (along_i * both - drag_i * by_i) / size
+    tangent = (give_i * by_i - drag_i * both) / size
+    left = give - both * normal - by_i * tangent
+    return rough * abs(drag - by * normal - across * tangent) < SINGLE * left
+
+
+@inner
+@no_type_check
+def _rows(world, o, space, j, cosine, sine):
+    """How gap and place of a loaded row's point move with the pose."""
+    t, k = space.chosen[j, 1], space.chosen[j, 2]
+    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+    u, v = object_normal(world, o, t, cosine, sine)
+    x, z = space.place[t, k, 0], space.place[t, k, 1]
+    return (nx, nz, v * x - u * z), (nz, -nx, -(u * x + v * z))
+
+
+@inner(error_model="numpy", forceinline=True)
+@no_type_check
+def _product(law, one, other):
+    """Of two rows, as the arm's spring yields to them."""
+    return (
+        one[0] * other[0] / law.stiffness[0]
+        + one[1] * other[1] / law.stiffness[1]
+        + one[2] * other[2] / law.stiffness[2]
+    )

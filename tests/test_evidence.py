@@ -66,6 +66,8 @@ class MadeUp:
         ([(0, 90), (-5, 90), (99, 90)], (1,)),  # or less than rough ones
         ([(0, 90), (9, 90), (5, 90), (5.5, 90), (99, 90)], (1,)),  # which missed what came before
         ([(0, 90), (2, 90), (6, 90), (6.5, 90), (99, 90)], (2, 3)),  # or what comes after
+        # however few are left by a heavy one before
+        ([(0, 90), (1, 1), (0.2, 60), (99, 90)], (1, 2)),
         # while few count
         ([(0, 90), (0, 3), (0.2, 3), (0.1, 3), (0, 3), (99, 90)], (1, 2, 3, 4)),
         ([(10 * k, 50) for k in range(20)], (PASSES,)),  # and not for ever

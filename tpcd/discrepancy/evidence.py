@@ -32,7 +32,8 @@ PASSES = 5
 CLIMBS = 1.0
 """Change of log evidence with which they are,"""
 ENOUGH = 10
-"""and effective number below which."""
+"""and effective number below which, of the last draws or of all that count: a single heavy draw of an
+earlier pass makes few of all of them."""
 
 
 def fit_model(
@@ -111,6 +112,7 @@ def draw_again(
         before = found.log_evidence
         if count == 0:
             change = max(change, 0.0)  # rough draws may say too much
-        if abs(change) <= CLIMBS and pool.effective_sample_size >= ENOUGH:
+        worth = max(pool.effective_sample_size, found.effective_sample_size)
+        if abs(change) <= CLIMBS and worth >= ENOUGH:
             break
     return pool

@@ -32,8 +32,8 @@ PASSES = 5
 CLIMBS = 1.0
 """Change of log evidence with which they are,"""
 ENOUGH = 10
-"""and effective number below which, of the last draws or of all that count: a single heavy draw of an
-earlier pass makes few of all of them."""
+"""and effective number below which, of the last draws or of all that count: a single heavy draw
+of an earlier pass makes few of all of them."""
 
 
 def fit_model(

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.parameters import Parameters
@@ -45,6 +45,11 @@ class ContactScene:
     def batch_shape(self) -> torch.Size:
         """Leading axes of the scene."""
         return self.friction.shape[:-1]
+
+    @property
+    def yields(self) -> Bool[Tensor, "*batch"]:
+        """Where any terrain yields, or its compliance is no number."""
+        return (self.compliance != 0).any(-1)
 
     def double(self) -> ContactScene:
         """The same scene in float64."""

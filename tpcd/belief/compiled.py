@@ -108,7 +108,7 @@ def compiled_filter(
     )
     found = Found(*(value.numpy() for value in answers))
     points = points_ee.detach().double().mT.contiguous().numpy()
-    soft = native.yields(conditions.compliance.flatten(1)).expand(count)
+    soft = (conditions.compliance != 0).flatten(1).any(-1).expand(count)
     for yielding, group in ((0, ~soft), (terrains, soft)):
         law, which = native.law_of(settings, yielding), torch.nonzero(group).flatten().numpy()
         explain = partial(explain_range, points, law, given, measured, by_theta, found, which)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.contact import ContactScene, place_points
@@ -143,13 +143,11 @@ def step(
     stiffness: Float[Tensor, "#b 3"],
     settings: StepSettings,
 ) -> Transition:
-    """Step b transitions; `owner` gives the position of each one's scene in the flat batch.
+    """Step b transitions; `owner` gives the position of each one's scene in the flat batch. All
+    of these scenes are rigid, or all have terrain that yields.
 
     Outlines may broadcast against the planes of the scene and are then not repeated.
     """
-    soft = yields(scene.compliance)[owner]
-    if bool(soft.any()) and not bool(soft.all()):
-        return _in_two(scene, owner, start, previous, command, stiffness, settings, soft)
     from tpcd.simulator.kernel import step_range
     from tpcd.simulator.kernel_request import Answer
 
@@ -162,7 +160,8 @@ def step(
     from_gap = torch.empty(count, terrains, 3, dtype=torch.float64)
     from_lever = torch.empty(count, terrains, 3, dtype=torch.float64)
     contacts = torch.empty(count, terrains, 4, dtype=torch.float64)
-    world, law = world_of(scene), law_of(settings, terrains if bool(soft.any()) else 0)
+    yielding = terrains if bool(scene.yields.reshape(-1)[owner].any()) else 0
+    world, law = world_of(scene), law_of(settings, yielding)
     request = request_of(scene, owner, start, previous, command, stiffness, settings)
     answer = Answer(
         pose.numpy(),
@@ -182,41 +181,6 @@ def step(
     return Transition(
         pose, wrench, mode, status, residual, from_start, from_gap, from_lever, contacts
     )
-
-
-def yields(compliance: Float[Tensor, "*batch t"]) -> Bool[Tensor, " b"]:
-    """Of a flat batch, where any terrain yields, or its compliance is no number."""
-    return (compliance.reshape(-1, compliance.shape[-1]) != 0).any(-1)
-
-
-def _in_two(
-    scene: ContactScene,
-    owner: Tensor,
-    start: Tensor,
-    previous: Tensor | None,
-    command: Tensor,
-    stiffness: Tensor,
-    settings: StepSettings,
-    soft: Tensor,
-) -> Transition:
-    """What is rigid and what is not, one after the other: no answer depends on what is beside."""
-    parts = []
-    order = torch.cat([torch.nonzero(which).flatten() for which in (~soft, soft)])
-    for index in (order[: int((~soft).sum())], order[int((~soft).sum()) :]):
-        parts.append(
-            step(
-                scene,
-                owner[index],
-                start[index],
-                None if previous is None else previous[index],
-                command[index],
-                stiffness if len(stiffness) == 1 else stiffness[index],
-                settings,
-            )
-        )
-    back = order.argsort()
-    both = zip(vars(parts[0]).items(), vars(parts[1]).values(), strict=True)
-    return Transition(**{name: torch.cat((one, other))[back] for (name, one), other in both})
 
 
 def world_of(scene: ContactScene) -> World:

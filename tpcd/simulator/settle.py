@@ -83,7 +83,7 @@ def settle_from(
     pose = (start if sought is None else sought.pose).clone()
     residual = torch.full_like(start[:, 0], torch.inf)
     status = torch.full((count,), int(StepStatus.NOT_CONVERGED), device=device)
-    rows = DEGREES + (terrains if bool((scene.compliance != 0).any()) else 0)
+    rows = DEGREES + (terrains if bool(scene.yields.any()) else 0)
     contacts = no_contacts(count, rows, start) if sought is None else sought.contacts
     extent = scene.points_ee.norm(dim=-1).amax(-1)
     running = torch.arange(count, device=device)

@@ -63,16 +63,30 @@ def simulate_step(
     previous = None if previous is None else previous.expand(*batch, 3).reshape(-1, 3)
     owner = torch.arange(scene.batch_shape.numel(), device=pose.device)
     owner = owner.reshape(scene.batch_shape).expand(batch).reshape(-1)
-    if _use_native(
-        engine, scene, (pose, stiffness, command, *(() if previous is None else (previous,)))
-    ):
-        shared = stiffness.reshape(-1, 3)
-        flat = native.step(scene, owner, pose, previous, command, shared, settings)
-        _relax_jammed(flat, scene, owner, pose, previous, command, stiffness, settings)
+    given = (pose, stiffness, command, *(() if previous is None else (previous,)))
+    compiled = _use_native(engine, scene, given)
+    yields = scene.yields.reshape(-1)[owner]
+    groups = [torch.nonzero(group).flatten() for group in (~yields, yields) if bool(group.any())]
+    if len(groups) < 2:
+        flat = _answer(compiled, scene, owner, pose, previous, command, stiffness, settings)
     else:
-        flat = _step_finite(
-            scene.gather(owner).double(), pose.double(), previous, command, stiffness, settings
-        )
+        # Rigid scenes apart from those that yield: no answer depends on what is beside it.
+        parts = [
+            _answer(
+                compiled,
+                scene,
+                owner[index],
+                pose[index],
+                None if previous is None else previous[index],
+                command[index],
+                own(stiffness, index),
+                settings,
+            )
+            for index in groups
+        ]
+        back = torch.cat(groups).argsort()
+        both = zip(vars(parts[0]).items(), vars(parts[1]).values(), strict=True)
+        flat = Transition(**{name: torch.cat((one, other))[back] for (name, one), other in both})
     terrains = len(scene.terrains)
     return Transition(
         pose=flat.pose.reshape(*batch, 3),
@@ -130,6 +144,27 @@ def _use_native(engine: Engine, scene: ContactScene, given: tuple[Tensor, ...]) 
     return possible and engine != "torch"
 
 
+def _answer(
+    compiled: bool,
+    scene: ContactScene,
+    owner: Tensor,
+    pose: Tensor,
+    previous: Tensor | None,
+    command: Tensor,
+    stiffness: Tensor,
+    settings: StepSettings,
+) -> Transition:
+    """Step transitions whose scenes are all rigid, or all yield."""
+    if not compiled:
+        return _step_finite(
+            scene.gather(owner).double(), pose.double(), previous, command, stiffness, settings
+        )
+    shared = stiffness.reshape(-1, 3)
+    flat = native.step(scene, owner, pose, previous, command, shared, settings)
+    _relax_jammed(flat, scene, owner, pose, previous, command, stiffness, settings)
+    return flat
+
+
 def _relax_jammed(
     flat: Transition,
     scene: ContactScene,
@@ -145,9 +180,9 @@ def _relax_jammed(
     if len(jammed) == 0:
         return
     before = None if previous is None else previous[jammed]
-    part = _step_finite(
-        scene.gather(owner[jammed]).double(),
-        pose[jammed].double(),
+    part = follow_path(
+        scene.gather(owner[jammed]),
+        pose[jammed],
         before,
         command[jammed],
         own(stiffness, jammed),
@@ -165,8 +200,7 @@ def _step_finite(
     stiffness: Tensor,
     settings: StepSettings,
 ) -> Transition:
-    """Step what is finite, rigid scenes apart from those that yield, and flag the rest, which then
-    touches no gradient of the others."""
+    """Step what is finite and flag the rest, which then touches no gradient of the others."""
     given = [start, command, scene.friction, *([] if previous is None else [previous])]
     with torch.no_grad():
         gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
@@ -175,20 +209,17 @@ def _step_finite(
         for value in given:
             finite = finite & torch.isfinite(value).all(-1)
         finite = finite & ((scene.compliance >= 0) & (scene.compliance < torch.inf)).all(-1)
-        soft = native.yields(scene.compliance)
-    groups = [group for group in (finite & ~soft, finite & soft) if bool(group.any())]
-    if len(groups) == 1 and bool(groups[0].all()):
+    if bool(finite.all()):
         return follow_path(scene, start, previous, command, stiffness, settings)
+    index = torch.nonzero(finite).flatten()
+    before = None if previous is None else previous[index]
+    part = follow_path(
+        scene.gather(index), start[index], before, command[index], own(stiffness, index), settings
+    )
     blank = {"mode": int(ContactMode.FREE), "status": int(StepStatus.INVALID_INPUT)}
-    whole: dict[str, Tensor] = {}
-    for index in (torch.nonzero(group).flatten() for group in groups or [finite]):
-        before = None if previous is None else previous[index]
-        each = own(stiffness, index)
-        part = follow_path(
-            scene.gather(index), start[index], before, command[index], each, settings
-        )
-        for name, value in vars(part).items():
-            fill = blank.get(name, torch.inf if name == "residual" else torch.nan)
-            empty = value.new_full((len(start), *value.shape[1:]), fill)
-            whole[name] = whole.get(name, empty).index_copy(0, index, value)
+    whole = {}
+    for name, value in vars(part).items():
+        fill = blank.get(name, torch.inf if name == "residual" else torch.nan)
+        empty = value.new_full((len(start), *value.shape[1:]), fill)
+        whole[name] = empty.index_copy(0, index, value)
     return Transition(**whole)

@@ -86,7 +86,8 @@ def rests_one_way(
     contacts: ContactSet,
     stiffness: Float[Tensor, "*each 3"],
 ) -> Bool[Tensor, " b"]:
-    """Whether what one point each of two terrains holds surely rests in one way."""
+    """Whether what one point each of two terrains holds surely rests in one way, at settled poses
+    [m, m, rad] of an arm with the diagonal of `stiffness` [N/m, N/m, N·m/rad]."""
     loaded = contacts.multiplier > 0
     first = loaded.long().argmax(-1, keepdim=True)
     beside = loaded & (contacts.terrain != contacts.terrain.gather(1, first))

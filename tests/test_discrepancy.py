@@ -176,7 +176,8 @@ def test_a_diagnosis_that_was_stopped_goes_on_with_the_fits_it_had(
         raise AssertionError("a fit was made again")
 
     monkeypatch.setattr("tpcd.discrepancy.evidence._fitted", never)
-    monkeypatch.setattr("tpcd.discrepancy.screening._peak", never)
+    monkeypatch.setattr("tpcd.discrepancy.screening._climbed", never)
+    monkeypatch.setattr("tpcd.discrepancy.nested._weighed", never)
     again = diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
     assert again.log_evidence == whole.log_evidence and again.candidates == whole.candidates
     assert again.theta_after == whole.theta_after

@@ -19,6 +19,7 @@ from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
 from tpcd.discrepancy.memory import Memory
+from tpcd.discrepancy.nested import NestedGain
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.search import DiagnosisSettings
 from tpcd.discrepancy.settings import BEATEN, CLOSER
@@ -106,7 +107,7 @@ def test_an_effect_that_the_data_do_not_excite_is_looked_at_and_gains_nothing(ep
     bench = bench_of(episode)
     base = fit_model(bench.question, (), (0, 1))
     wall_friction = CATALOGUE[1]
-    (look,) = naming._glances(bench, base, [wall_friction], 1, False)
+    (look,) = naming._glances(bench, base, [wall_friction], 1, 40)
     with_it = fit_model(bench.question, (wall_friction,), (0, 1), start=(base,))
     gains = [one.log_evidence - base.log_evidence for one in (look, with_it)]
     assert max(gains) < 2.0 < SETTINGS.least_gain  # a look is Laplace's approximation
@@ -217,13 +218,61 @@ def test_what_came_close_is_asked_with_the_next_effect_too(
     assert bench.notes == ["wall_tilt failed beside floor_compliance: ValueError: no draw at all"]
 
 
+def looks_of(worth: dict[str, float]) -> list[Glance]:
+    """Looks that find such log evidences, or 60."""
+    one = torch.eye(1)
+    return [Glance(worth.get(e.name, 60.0), (1.0,), one[0], one, e) for e in CATALOGUE]
+
+
+@pytest.mark.parametrize(
+    ("looks", "draws", "adequate", "fitted"),
+    [
+        ((1.5, -4.0, -4.0), (-2.0, -4.0, -4.0), True, 0),  # draws know better than a look
+        ((-4.0, -4.0, -4.0), (0.5, -4.0, -4.0), True, 0),
+        ((-4.0, -4.0, -4.0), (0.5, -4.0, -4.0), False, 1),
+        ((-4.0, -4.0, -4.0), (-4.0, -4.0, 2.0), True, 1),
+        ((8.0, -4.0, -4.0), (-9.0, -4.0, -4.0), True, 1),  # as what takes the scene elsewhere
+    ],
+)
+def test_what_does_not_promise_to_gain_is_not_fitted(
+    looks, draws, adequate: bool, fitted: int, episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Gains by looks beside that at the model itself, and by draws of the model."""
+    bench = bench_of(episode)
+    names = [effect.name for effect in CATALOGUE]
+    given = looks_of({n: 100.0 + gain for n, gain in zip(names, looks, strict=True)})
+    by_draws = dict(zip(names, draws, strict=True))
+    asked: list[str] = []
+
+    def fit(question: Question, effects, seeds, *_, **__) -> Fit:
+        asked.append(effects[-1].name)
+        return Fit(tuple(effects), question.step, question.scene, (107.0,), ())
+
+    monkeypatch.setattr(naming, "_glances", lambda *_: given)
+    monkeypatch.setattr(naming, "peak", lambda *_: looks_of({names[0]: 100.0})[0])
+    monkeypatch.setattr(
+        naming, "nested_gain", lambda *a: NestedGain(by_draws[a[-1].effect.name], 0.1)
+    )
+    monkeypatch.setattr(naming, "fit_model", fit)
+    monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
+    monkeypatch.setattr(naming, "looked_closer", lambda bench, current, near: (current, near))
+    base = Fit((), bench.question.step, bench.question.scene, (107.0,), ())
+    found = naming.name_one(bench, base, CATALOGUE, adequate)
+    assert len(asked) == fitted and found.best is None
+    noted = {c.name: c.gain for c in bench.candidates}
+    for name, look in zip(names, looks, strict=True):
+        promised = look if look > by_draws[name] + 4 else by_draws[name]
+        expected = 0.0 if name in asked else promised
+        assert noted[name] == pytest.approx(expected)
+
+
 def test_what_looks_far_worse_than_a_full_fit_gets_none(
     episode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second looks less than `BEATEN` below what the first is worth, the third more."""
     bench = bench_of(episode)
     worth = dict(zip((e.name for e in CATALOGUE), (100.0, 80.0, 70.0), strict=True))
-    looks = [Glance(e, worth[e.name], (1.0,), torch.zeros(1)) for e in CATALOGUE]
+    looks = looks_of(worth)
     fitted: list[str] = []
 
     def fit(question: Question, effects, seeds, *_, **__) -> Fit:
@@ -231,6 +280,8 @@ def test_what_looks_far_worse_than_a_full_fit_gets_none(
         return Fit(tuple(effects), question.step, question.scene, (worth[fitted[-1]],), ())
 
     monkeypatch.setattr(naming, "_glances", lambda *_: looks)
+    monkeypatch.setattr(naming, "peak", lambda *_: looks_of({})[0])
+    monkeypatch.setattr(naming, "nested_gain", lambda *_: NestedGain(-math.inf, math.inf))
     monkeypatch.setattr(naming, "fit_model", fit)
     monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
     monkeypatch.setattr(naming, "looked_closer", lambda bench, current, near: (current, near))

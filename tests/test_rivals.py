@@ -125,9 +125,8 @@ class Stand:
         return again(current), [again(fit) for fit in near]
 
     def look(self, question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
-        return Glance(
-            effect, self.looks.get((*base.names, effect.name), 30.0), (0.1,), torch.zeros(9)
-        )
+        found = self.looks.get((*base.names, effect.name), 30.0)
+        return Glance(found, (0.1,), torch.zeros(9), torch.eye(9), effect)
 
     def left(self, fit: Fit) -> Adequacy:
         return Adequacy(0.01, 0.5, 0.5, ()) if self.adequate else Adequacy(0.3, 1e-9, 0.5, ())

@@ -18,16 +18,20 @@ from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
-from tpcd.discrepancy.screening import Glance, glance
+from tpcd.discrepancy.nested import NestedGain, nested_gain
+from tpcd.discrepancy.screening import Glance, glance, peak
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     BEATEN,
     CLEAR,
+    ELSEWHERE,
     FRESH,
     IMPROVED,
+    PROMISING,
+    TOLD,
     UNDECIDED,
+    WEIGHED,
     WITHIN,
-    WORTH_FITTING,
 )
 from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, WIDE_SHAPE, Variant
 from tpcd.discrepancy.workbench import (
@@ -63,11 +67,13 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     """Try one more effect of the pool; `adequate` says whether the model so far explains all."""
     settings, question = bench.settings, bench.question
     number = len(current.effects) - bench.given + 1
-    glances = _glances(bench, current, pool, number, adequate)
+    fresh = FRESH[adequate] if settings.from_prior else 0
+    glances = _glances(bench, current, pool, number, fresh)
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
-    worth = current.log_evidence + WORTH_FITTING[adequate]
-    chosen = [g for g in glances[: settings.full_fits] if g.log_evidence > worth]
+    gains = _gains(bench, current, glances, number, fresh)
+    ranked = sorted(glances, key=lambda g: -gains[g.effect.name])[: settings.full_fits]
+    chosen = [g for g in ranked if gains[g.effect.name] > PROMISING[adequate]]
     places = {g.effect.name: g.place[None] for g in glances}
 
     def fitted(effect: Effect) -> Fit:
@@ -107,7 +113,9 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
         current, near = looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)
-        gain = (g if full is None else full).log_evidence - current.log_evidence
+        gain = gains[g.effect.name]
+        if full is not None:
+            gain = full.log_evidence - current.log_evidence
         by_seed = () if full is None else full.by_seed
         bench.candidates.append(Candidate(g.effect.name, number, gain, by_seed))
     if not near:
@@ -188,14 +196,36 @@ def _glances(
     current: Fit,
     pool: Sequence[Effect],
     number: int,
-    adequate: bool,
+    fresh: int,
 ) -> list[Glance]:
     """A quick look at every effect, the best first. Also at those that the data hardly excite: what
     an effect does to nothing it cannot gain."""
     chosen = [effect for effect in pool if effect.name not in current.names]
-    fresh = FRESH[adequate] if bench.settings.from_prior else 0
     glances = each_of(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
     return sorted(glances, key=lambda g: -g.log_evidence)
+
+
+def _gains(
+    bench: Workbench, current: Fit, glances: Sequence[Glance], number: int, fresh: int
+) -> dict[str, float]:
+    """What effects promise to gain: by their look beside one at the model itself, and for the best
+    of them by the draws of the model, unless a look finds much more, as it does where an effect
+    takes the scene elsewhere."""
+    question = bench.question
+    own = bench.attempt(
+        "the look at the model itself failed", lambda: peak(question, current, (), fresh)
+    )
+    reached = current.log_evidence if own is None else own.log_evidence
+    gains = {g.effect.name: g.log_evidence - reached for g in glances}
+    looks = {g.effect.name: g for g in glances[:WEIGHED]}
+
+    def weighed(effect: Effect) -> tuple[str, NestedGain]:
+        return effect.name, nested_gain(question, current, looks[effect.name])
+
+    for name, found in each_of(bench, [g.effect for g in looks.values()], number, weighed):
+        told = found.std < TOLD and gains[name] < found.gain + ELSEWHERE
+        gains[name] = found.gain if told else max(gains[name], found.gain)
+    return gains
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

@@ -19,7 +19,7 @@ from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
 from tpcd.discrepancy.fit import Fit, Question, fit_stream
-from tpcd.effects.protocol import Effect
+from tpcd.effects.protocol import Effect, effect_parameters
 
 PLACES = 16
 """Places of the base fit from which points climb, for an effect of one parameter."""
@@ -31,44 +31,49 @@ KEPT = 6
 
 
 @dataclass(frozen=True)
-class Glance:
-    """What the quick look at one candidate found."""
+class Peak:
+    """The best mode that a quick look at a model found."""
 
-    effect: Effect
     log_evidence: float
-    """By Laplace's approximation at the best mode found."""
+    """By Laplace's approximation."""
     sd: tuple[float, ...]
-    """Standard deviation there of each parameter of the effect, in SI units."""
+    """Standard deviation there of each parameter of the effect that was added, in SI units."""
     place: Float[Tensor, " s"]
-    """The mode, in unconstrained coordinates."""
+    """The mode, in unconstrained coordinates,"""
+    information: Float[Tensor, "s s"]
+    """and the curvature there."""
 
 
 @dataclass(frozen=True)
-class _Peak:
-    """The numbers of a glance."""
+class Glance(Peak):
+    """What the quick look at one candidate found."""
 
-    log_evidence: float
-    sd: tuple[float, ...]
-    place: Float[Tensor, " s"]
+    effect: Effect
 
 
 def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
     """Climb to the modes of the base model's effects and one more; `fresh` points set out from
     all over the prior."""
-    effects = (*base.effects, effect)
+    found = peak(question, base, (effect,), fresh)
+    return Glance(**vars(found), effect=effect)
+
+
+def peak(question: Question, base: Fit, more: tuple[Effect, ...], fresh: int) -> Peak:
+    """The same for one effect more, or for the model as it is."""
+    effects = (*base.effects, *more)
     names = tuple(e.name for e in effects)
     prior = question.scene.with_effects(effects)
     key = (question.fingerprint, names, prior.low, prior.high, base.fingerprint, fresh)
-    found = question.memory.recall(key, _Peak, lambda: _peak(question, base, prior, fresh))
-    return Glance(effect, found.log_evidence, found.sd, found.place)
+    new = len(effect_parameters(more))
+    return question.memory.recall(key, Peak, lambda: _climbed(question, base, prior, new, fresh))
 
 
-def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _Peak:
-    effects = prior.effects
+def _climbed(question: Question, base: Fit, prior: ParameterPrior, new: int, fresh: int) -> Peak:
+    """Where points arrive under a prior whose last `new` parameters the base fit has not."""
     target = ContactTarget(prior, question.misfit, base.step, question.history)
-    generator = fit_stream(question, effects, 0)
+    generator = fit_stream(question, prior.effects, 0)
     # Two parameters, such as how high a step is and where, are rarely right by chance together.
-    count = min(PLACES * len(effects[-1].parameters) ** 2, MOST_PLACES)
+    count = min(PLACES * max(new, 1) ** 2, MOST_PLACES)
     start = set_out(target, carried(base, prior, generator, count, repeat=count > PLACES))
     if count > PLACES:
         begun = climb(target, start, FRESH_ROUNDS)
@@ -85,6 +90,6 @@ def _peak(question: Question, base: Fit, prior: ParameterPrior, fresh: int) -> _
     top = int(each.argmax())
     covariance = torch.linalg.inv(information[top])
     vector, slope = prior.to_vector_with_slope(best.points[top][:-1])
-    own = slice(len(vector) - len(effects[-1].parameters), len(vector))
     sd = covariance.diagonal()[:-1].sqrt() * slope
-    return _Peak(float(each[top]), tuple(sd[own].tolist()), best.points[top])
+    own = sd[len(vector) - new :]
+    return Peak(float(each[top]), tuple(own.tolist()), best.points[top], information[top])

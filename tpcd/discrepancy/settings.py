@@ -15,9 +15,15 @@ FEWEST_ROWS = 10
 FRESH = {True: 8, False: 40}
 """Points of a quick look that set out from all over the prior, where the model explains the data
 and where it does not."""
-WORTH_FITTING = {True: -2.0, False: -25.0}
-"""Gain of the quick look from which a candidate gets a full fit at all: where the model explains
-the data as it is, and where it does not."""
+WEIGHED = 6
+"""Candidates whose gain is weighed on draws of the model without them."""
+TOLD = 0.5
+"""Standard error of that gain below which it stands for what the quick look finds,"""
+ELSEWHERE = 4.0
+"""if that is not so much more: looks at effects that are not there were off by 2.2 at most."""
+PROMISING = {True: 1.0, False: 0.0}
+"""Gain that a candidate has to promise for a full fit: where the model explains the data as it is,
+and where it does not."""
 BEATEN = 25.0
 """A candidate whose quick look is so far below the best full fit gets none."""
 WITHIN = 8.0

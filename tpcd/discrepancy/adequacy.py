@@ -201,14 +201,16 @@ def _modes(outcome: Outcome) -> list[str]:
 def _designs(
     history: History, outcome: Outcome, modes: list[str], used: Tensor
 ) -> tuple[list[Tensor], list[tuple[str, str]]]:
-    """Weights (n) of the transitions in every cell, and mode and covariate of the cells."""
+    """Weights (n) of the transitions in every cell, and mode and covariate of the cells. Covariates
+    are what the model says before it has seen a row: where contact holds an object, what is read
+    of its place differs by noise alone, of which the row's innovation has its part."""
     load = outcome.load[0, 1:].sum(-1)
     values = {
         "mean": torch.ones_like(load),
         "size": torch.ones_like(load),
         "load": load,
-        "place": history.poses[1:, 0],
-        "angle": history.poses[1:, 2],
+        "place": outcome.pose[0, 1:, 0],
+        "angle": outcome.pose[0, 1:, 2],
         "time": history.rows.share[1:],
     }
     designs, names = [], []

@@ -89,6 +89,7 @@ def _curve_figure(cells: Sequence[Row], truth: str) -> Any:
     )
     panel.set_yscale("log")
     panel.set_xlabel("exploration moves")
+    panel.locator_params("x", integer=True)
     panel.set_ylabel("mean error of x and z [mm]")
     legend_below(figure, entries, columns=3)
     return figure

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.path import Path as Outline
+from matplotlib.quiver import Quiver
 
 from tpcd import figures
 from tpcd.figures.outline import inside_probability
@@ -219,6 +220,29 @@ def test_the_scene_shows_every_position_and_both_surfaces() -> None:
     np.testing.assert_allclose(path.get_xdata(), 120 * np.linspace(0, 1, 20), atol=1e-9)
     (left, right), (bottom, top) = panel.get_xlim(), panel.get_ylim()
     assert left < 0 and right > 176 and bottom < -7 and top > 60
+
+
+def test_forces_enter_the_outline_where_it_is_touched() -> None:
+    """A square beside the end effector, pushed from below and from the right, and hardly at all."""
+    square = np.array([[0.02, -0.02], [0.06, -0.02], [0.06, 0.02], [0.02, 0.02]])
+    poses = np.array([[0.0, 0.05, 0.0], [0.01, 0.05, 0.0], [0.02, 0.05, 0.0]])
+    up, left, small = (0.0, 10.0, 10.0 * 0.03), (-5.0, 0.0, 5.0 * 0.01), (0.5, 0.0, 0.0)
+    figure = moved(
+        poses=poses, points_ee=square, commands=None, wrenches=np.array([up, left, small])
+    )
+    (panel,) = figure.axes
+    (arrows,) = (one for one in panel.collections if isinstance(one, Quiver))
+    tips = arrows.XY + np.stack((arrows.U, arrows.V), axis=-1)
+    np.testing.assert_allclose(tips, [[30.0, 30.0], [70.0, 60.0]], atol=1e-9)
+    lengths = np.hypot(arrows.U, arrows.V)
+    assert lengths[1] == pytest.approx(0.5 * lengths[0])
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "contact force, at most 10.0 N" in labels
+
+
+def test_a_scene_without_any_force_has_no_arrows() -> None:
+    (panel,) = moved(wrenches=np.zeros((20, 3))).axes
+    assert not any(isinstance(one, Quiver) for one in panel.collections)
 
 
 def test_a_surface_at_zero_is_a_truth_too() -> None:

@@ -90,6 +90,7 @@ def draw_estimation(
         true_floor=None if truth is None else truth.scene["floor_height"],
         true_wall=None if truth is None else truth.scene["wall_position"],
         commands=episode.commands.numpy(),
+        wrenches=episode.wrenches.numpy(),
         outline="a central draw" if vertices is None else "",
     )
     save_figure(figure, folder, f"{prefix}scene", writer, last, heading)

@@ -1,12 +1,13 @@
 """The movement of the object in the world, with what is believed of floor and wall.
 
-Outlines from first (light) to last step (dark), the path of the end effector, and floor
-and wall as lines with their 90 % bands.
+Outlines from first (light) to last step (dark) with the force that pushes on each, the path of
+the end effector, and floor and wall as lines with their 90 % bands.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.artist import Artist
@@ -15,10 +16,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
-from tpcd.figures.style import FLOOR, TRUTH, WALL, Array, LegendKey, legend_below, panels
+from tpcd.figures.style import FLOOR, FORCE, TRUTH, WALL, Array, LegendKey, legend_below, panels
 
 MOST_OUTLINES = 12
 """More outlines than this in one picture hide each other."""
+LEAST_FORCE = 0.1
+"""Forces below this share of the largest one are not drawn."""
+FORCE_LENGTH = 0.35
+"""Length of the arrow of the largest force, as a share of the object's size."""
 
 
 def scene(
@@ -30,13 +35,16 @@ def scene(
     true_floor: float | None = None,
     true_wall: float | None = None,
     commands: Float[Array, "n 3"] | None = None,
+    wrenches: Float[Array, "n 3"] | None = None,
     outline: str = "",
 ) -> Figure:
     """Draw n poses [m, m, rad] of an outline given in the end-effector frame [m].
 
     `floor` and `wall` are (mean, low, high) of the floor's z and the wall's x [m] in the
-    world; `true_floor` and `true_wall` add dashed lines, `commands` the commanded path. What is to
-    be said of the outline goes to the legend.
+    world; `true_floor` and `true_wall` add dashed lines, `commands` the commanded path, and
+    `wrenches` (F_x, F_z, torque about the end effector) [N, N, N·m] an arrow where the line of the
+    force enters the outline, which for a single contact is the contact point. What is to be said
+    of the outline goes to the legend.
     """
     poses, points = np.asarray(poses, dtype=float), 1e3 * np.asarray(points_ee, dtype=float)
     figure, (panel,) = panels(1, 1, 6.4, 4.8)
@@ -61,6 +69,19 @@ def scene(
             *commanded.T, color="#D55E00", linewidth=1.3, linestyle=":"
         )
         drawn.append(commanded)
+    if wrenches is not None:
+        size = float(np.ptp(points, axis=0).max())
+        forces = np.asarray(wrenches, dtype=float)[chosen]
+        arrows, largest = _force_arrows(outlines, path[chosen], forces, FORCE_LENGTH * size)
+        if len(arrows):
+            tails, ways = arrows[:, 0], arrows[:, 1] - arrows[:, 0]
+            panel.quiver(
+                *tails.T, *ways.T, color=FORCE, angles="xy", scale_units="xy", scale=1.0,
+                width=0.005, zorder=3,
+            )  # fmt: skip
+            key = Line2D([], [], color=FORCE, marker=">", markersize=4)
+            entries[f"contact force, at most {largest:.1f} N"] = key
+            drawn.append(tails)
 
     low, high = np.concatenate(drawn).min(axis=0), np.concatenate(drawn).max(axis=0)
     surfaces = [
@@ -93,6 +114,28 @@ def scene(
         entries["true surface"] = Line2D([], [], **dashed)
     legend_below(figure, entries, columns=3)
     return figure
+
+
+def _force_arrows(
+    outlines: list[np.ndarray], places: np.ndarray, wrenches: np.ndarray, length: float
+) -> tuple[np.ndarray, float]:
+    """Tails and tips [mm] of arrows (k, 2, 2) of forces that enter the outlines at their tips, the
+    largest one of such a length, and its size [N]. `places` [mm] are those of the end effector."""
+    size = np.linalg.norm(wrenches[:, :2], axis=-1)
+    largest, arrows = float(size.max()), []
+    for placed, place, wrench, force in zip(outlines, places, wrenches, size, strict=True):
+        if not force > LEAST_FORCE * largest:
+            continue
+        way = wrench[:2] / force
+        # Points r of the line of the force have the torque r x F.
+        nearest = place + 1e3 * wrench[2] / force * np.array([way[1], -way[0]])
+        reach = float(np.abs(placed - nearest).sum(axis=-1).max())
+        line = shapely.LineString([nearest - reach * way, nearest + reach * way])
+        met = shapely.get_coordinates(line.intersection(shapely.LinearRing(placed)))
+        if len(met):
+            tip = met[((met - nearest) @ way).argmin()]
+            arrows.append((tip - length * force / largest * way, tip))
+    return np.array(arrows), largest
 
 
 def _surface(

@@ -28,6 +28,7 @@ BELIEF = "#0072B2"
 TRUTH = "#000000"
 FLOOR = "#8C6D46"
 WALL = "#5F6B73"
+FORCE = "#009E73"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours that stay apart for colour-blind readers (Okabe and Ito 2008)."""
 

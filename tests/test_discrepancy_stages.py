@@ -13,7 +13,7 @@ from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import naming, search, workbench
+from tpcd.discrepancy import naming, promises, search, workbench
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.evidence import fit_model
@@ -107,7 +107,7 @@ def test_an_effect_that_the_data_do_not_excite_is_looked_at_and_gains_nothing(ep
     bench = bench_of(episode)
     base = fit_model(bench.question, (), (0, 1))
     wall_friction = CATALOGUE[1]
-    (look,) = naming._glances(bench, base, [wall_friction], 1, 40)
+    (look,) = promises.looks_at(bench, base, [wall_friction], 1, 40)
     with_it = fit_model(bench.question, (wall_friction,), (0, 1), start=(base,))
     gains = [one.log_evidence - base.log_evidence for one in (look, with_it)]
     assert max(gains) < 2.0 < SETTINGS.least_gain  # a look is Laplace's approximation
@@ -225,17 +225,18 @@ def looks_of(worth: dict[str, float]) -> list[Glance]:
 
 
 @pytest.mark.parametrize(
-    ("looks", "draws", "adequate", "fitted"),
+    ("looks", "draws", "std", "adequate", "fitted"),
     [
-        ((1.5, -4.0, -4.0), (-2.0, -4.0, -4.0), True, 0),  # draws know better than a look
-        ((-4.0, -4.0, -4.0), (0.5, -4.0, -4.0), True, 0),
-        ((-4.0, -4.0, -4.0), (0.5, -4.0, -4.0), False, 1),
-        ((-4.0, -4.0, -4.0), (-4.0, -4.0, 2.0), True, 1),
-        ((8.0, -4.0, -4.0), (-9.0, -4.0, -4.0), True, 1),  # as what takes the scene elsewhere
+        ((1.5, -4.0, -4.0), (-2.0, -4.0, -4.0), 0.1, True, 0),  # draws know better than a look
+        ((1.5, -4.0, -4.0), (-2.0, -4.0, -4.0), 0.9, True, 1),  # but not where they are few
+        ((-4.0, -4.0, -4.0), (0.5, -4.0, -4.0), 0.1, True, 0),
+        ((-4.0, -4.0, -4.0), (0.5, -4.0, -4.0), 0.1, False, 1),
+        ((-4.0, -4.0, -4.0), (-4.0, -4.0, 2.0), 0.1, True, 1),
+        ((8.0, -4.0, -4.0), (-9.0, -4.0, -4.0), 0.1, True, 1),  # what takes the scene elsewhere
     ],
 )
 def test_what_does_not_promise_to_gain_is_not_fitted(
-    looks, draws, adequate: bool, fitted: int, episode, monkeypatch: pytest.MonkeyPatch
+    looks, draws, std: float, adequate: bool, fitted: int, episode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Gains by looks beside that at the model itself, and by draws of the model."""
     bench = bench_of(episode)
@@ -248,10 +249,10 @@ def test_what_does_not_promise_to_gain_is_not_fitted(
         asked.append(effects[-1].name)
         return Fit(tuple(effects), question.step, question.scene, (107.0,), ())
 
-    monkeypatch.setattr(naming, "_glances", lambda *_: given)
-    monkeypatch.setattr(naming, "peak", lambda *_: looks_of({names[0]: 100.0})[0])
+    monkeypatch.setattr(naming, "looks_at", lambda *_: given)
+    monkeypatch.setattr(promises, "peak", lambda *_: looks_of({names[0]: 100.0})[0])
     monkeypatch.setattr(
-        naming, "nested_gain", lambda *a: NestedGain(by_draws[a[-1].effect.name], 0.1)
+        promises, "nested_gain", lambda *a: NestedGain(by_draws[a[-1].effect.name], std)
     )
     monkeypatch.setattr(naming, "fit_model", fit)
     monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
@@ -261,7 +262,9 @@ def test_what_does_not_promise_to_gain_is_not_fitted(
     assert len(asked) == fitted and found.best is None
     noted = {c.name: c.gain for c in bench.candidates}
     for name, look in zip(names, looks, strict=True):
-        promised = look if look > by_draws[name] + 4 else by_draws[name]
+        promised = max(look, by_draws[name])
+        if std < 0.5 and look < by_draws[name] + 4:
+            promised = by_draws[name]
         expected = 0.0 if name in asked else promised
         assert noted[name] == pytest.approx(expected)
 
@@ -279,9 +282,9 @@ def test_what_looks_far_worse_than_a_full_fit_gets_none(
         fitted.extend(effect.name for effect in effects)
         return Fit(tuple(effects), question.step, question.scene, (worth[fitted[-1]],), ())
 
-    monkeypatch.setattr(naming, "_glances", lambda *_: looks)
-    monkeypatch.setattr(naming, "peak", lambda *_: looks_of({})[0])
-    monkeypatch.setattr(naming, "nested_gain", lambda *_: NestedGain(-math.inf, math.inf))
+    monkeypatch.setattr(naming, "looks_at", lambda *_: looks)
+    monkeypatch.setattr(promises, "peak", lambda *_: looks_of({})[0])
+    monkeypatch.setattr(promises, "nested_gain", lambda *_: NestedGain(-math.inf, math.inf))
     monkeypatch.setattr(naming, "fit_model", fit)
     monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
     monkeypatch.setattr(naming, "looked_closer", lambda bench, current, near: (current, near))
@@ -294,6 +297,77 @@ def test_what_looks_far_worse_than_a_full_fit_gets_none(
     looks[0] = replace(looks[0], log_evidence=90.0)
     naming.name_one(bench, base, CATALOGUE, False)
     assert fitted == [effect.name for effect in CATALOGUE]
+    # And what draws promise keeps the last one in too, while the second, far below, stays out.
+    by_draws = dict(zip(worth, (30.0, -5.0, 38.0), strict=True))
+    monkeypatch.setattr(
+        promises, "nested_gain", lambda *a: NestedGain(by_draws[a[-1].effect.name], 0.1)
+    )
+    looks[:] = looks_of(dict(zip(worth, (110.0, 61.0, 70.0), strict=True)))
+    worth |= {name: 100.0 for name in worth}
+    fitted.clear()
+    naming.name_one(bench, base, CATALOGUE, False)
+    assert fitted == [CATALOGUE[k].name for k in (0, 2)]
+
+
+def test_nothing_that_was_not_weighed_comes_before_what_was(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The look at the best one promises too much; so do those at the others, as draws tell."""
+    bench = bench_of(episode)
+    names = [effect.name for effect in CATALOGUE]
+    looks = looks_of(dict(zip(names, (101.5, 101.0, 99.0), strict=True)))
+    asked: list[str] = []
+
+    def weighed(question: Question, fit: Fit, look: Glance) -> NestedGain:
+        asked.append(look.effect.name)
+        return NestedGain(-2.0, 0.1)
+
+    base = Fit((), bench.question.step, bench.question.scene, (100.0,), ())
+    monkeypatch.setattr(promises, "WEIGHED", 1)
+    monkeypatch.setattr(promises, "nested_gain", weighed)
+    gains = promises.promised_gains(bench, base, looks, 1, 100.0)
+    assert asked == names[:2]
+    assert [gains[name] for name in names] == [-2.0, -2.0, -1.0]
+
+
+def test_a_look_that_finds_more_than_the_fits_has_the_model_fitted_from_there(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = bench_of(episode)
+    base = Fit((), bench.question.step, bench.question.scene, (100.0,), ())
+    seen = looks_of({CATALOGUE[0].name: 121.0})[0]
+    begun: list[torch.Tensor] = []
+
+    def again(bench: Workbench, fit: Fit, *_, places: torch.Tensor) -> Fit:
+        begun.append(places)
+        return replace(fit, by_seed=(100.0, 120.0))
+
+    monkeypatch.setattr(promises, "peak", lambda *_: seen)
+    monkeypatch.setattr(promises, "fitted_again", again)
+    fit, reached = promises.seen_itself(bench, base, 8)
+    assert fit.log_evidence == 120.0 and reached == 121.0
+    assert len(begun) == 1 and torch.equal(begun[0], seen.place[None])
+    begun.clear()
+    promises.seen_itself(bench, fit, 8)
+    assert not begun
+
+
+def test_where_no_look_at_the_model_itself_is_had_its_fits_stand_for_it(
+    episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = bench_of(episode)
+    base = Fit((), bench.question.step, bench.question.scene, (100.0,), ())
+
+    def fails(*_) -> None:
+        raise ValueError("no mode at all")
+
+    monkeypatch.setattr(promises, "peak", fails)
+    assert promises.seen_itself(bench, base, 8) == (base, 100.0)
+    monkeypatch.setattr(promises, "nested_gain", fails)
+    looks = looks_of({CATALOGUE[0].name: 103.0})
+    gains = promises.promised_gains(bench, base, looks, 1, 100.0)
+    assert gains[CATALOGUE[0].name] == 3.0
+    assert any("the gain of floor_compliance by draws failed" in note for note in bench.notes)
 
 
 def test_a_search_from_where_the_model_arrived_alone_stays_so_when_it_looks_closer(

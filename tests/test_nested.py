@@ -78,7 +78,7 @@ def test_in_free_space_a_bias_gains_what_the_integral_over_it_says(bias: float) 
 
 @pytest.fixture(scope="module")
 def contact() -> Question:
-    """Steps on floor and wall, where the floor yields."""
+    """Steps on floor and wall, of a model that lacks nothing."""
     generator = torch.Generator().manual_seed(5)
     scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
     truth = make_truth(scene, "quasistatic")
@@ -101,6 +101,52 @@ def test_the_gain_is_that_of_two_fits(contact: Question, base: Fit, name: str) -
     expected = both.log_evidence - base.log_evidence
     assert found.gain == pytest.approx(expected, abs=4 * found.std + 0.5)
     assert found.gain < 0 and found.std < 0.3
+
+
+def test_an_effect_that_is_there_gains_what_two_fits_say_beside_another_effect() -> None:
+    """The floor yields, in a scene that is found by a model with another effect that is there."""
+    generator = torch.Generator().manual_seed(5)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    hidden = {"directional_friction": {"log_ratio": 0.1}, "floor_compliance": {"compliance": 2e-4}}
+    truth = make_truth(scene, "quasistatic", hidden, 20)
+    motion = make_motion("rich", scene, 20, generator)
+    question = question_of(record(truth, scene, motion, 20, generator).measured)
+    known, asked = (find_effect(name) for name in hidden)
+    base = fit_model(question, (known,), (0,))
+    both = fit_model(question, (known, asked), (0,), start=(base,))
+    found = nested_gain(question, base, glance(question, base, asked, 8))
+    expected = both.log_evidence - base.log_evidence
+    assert found.gain == pytest.approx(expected, abs=4 * found.std + 0.5)
+    assert found.gain > 5 and found.std < 0.5
+
+
+def test_few_draws_tell_nothing(contact: Question, base: Fit) -> None:
+    """Two draws of a model, or one that has nearly all of the weight, know no spread."""
+    look = glance(contact, base, find_effect("wall_tilt"), 0)
+    cloud = base.clouds[0]
+    weights = torch.full_like(cloud.weights, 1e-9)
+    weights[0] = 1.0
+    alone = replace(cloud, weights=weights / weights.sum())
+    two = replace(
+        cloud,
+        positions=cloud.positions[:2],
+        weights=torch.full((2,), 0.5).double(),
+        log_likelihood=cloud.log_likelihood[:2],
+    )
+    for few in (alone, two):
+        fit = replace(base, by_seed=base.by_seed[:1], clouds=(few,))
+        assert nested_gain(contact, fit, look).std == math.inf
+
+
+def test_seeds_count_by_their_evidence(base: Fit) -> None:
+    """In gains, not in what is reported; one that missed 3 nats does not count."""
+    one, other = (replace(c, log_evidence=e) for c, e in zip(base.clouds, (10.0, 9.0), strict=True))
+    fit = replace(base, by_seed=(10.0, 9.0), clouds=(one, other))
+    share = float(fit.cloud_by_evidence.weights[: len(one.weights)].sum())
+    assert share == pytest.approx(1 / (1 + math.exp(-1)), abs=1e-4)
+    assert float(fit.cloud.weights[: len(one.weights)].sum()) == pytest.approx(0.5, abs=1e-4)
+    missed = replace(fit, by_seed=(10.0, 6.0))
+    assert len(missed.cloud_by_evidence.weights) == len(one.weights)
 
 
 def test_what_nothing_excites_gains_nothing(contact: Question) -> None:

@@ -202,8 +202,9 @@ def _designs(
     history: History, outcome: Outcome, modes: list[str], used: Tensor
 ) -> tuple[list[Tensor], list[tuple[str, str]]]:
     """Weights (n) of the transitions in every cell, and mode and covariate of the cells. Covariates
-    are what the model says before it has seen a row: where contact holds an object, what is read
-    of its place differs by noise alone, of which the row's innovation has its part."""
+    are what the model says of a row and not what was read: where contact holds an object, readings
+    of its place differ by noise alone, of which the row's innovation has its part. (Where a row
+    tells much of the outline, as at a first contact, the model says it with that learnt.)"""
     load = outcome.load[0, 1:].sum(-1)
     values = {
         "mean": torch.ones_like(load),

@@ -52,9 +52,10 @@ class Candidate:
     round: int
     """From 1; 0 for another base model."""
     gain: float
-    """Log evidence minus that of the model of the round before."""
+    """Log evidence minus that of the model of the round before; without a full fit what the quick
+    look or the draws of that model promise."""
     by_seed: tuple[float, ...] = ()
-    """Log evidence on each seed of the full fit; empty where the quick look was all."""
+    """Log evidence on each seed of the full fit; empty without one."""
     outcome: str = ""
     """Accepted, or why not."""
 

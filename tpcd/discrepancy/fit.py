@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from tpcd.belief.belief import Belief, belief_of
 from tpcd.belief.cloud import Cloud
@@ -90,8 +92,22 @@ class Fit:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """Particles of all seeds together."""
-        return _joined(self.clouds)
+        """Particles of all seeds together, as a posterior is reported.
+
+        Differences of evidence between seeds are mostly noise of the sampler, and each seed has few
+        draws that count, all in one place. Seeds near the best therefore count alike, which keeps
+        what they disagree about in the posterior.
+        """
+        found = torch.tensor(self.by_seed, dtype=torch.float64)
+        return _joined(self.clouds, (found - found.max() + TIED).clamp(-math.inf, 0.0))
+
+    @cached_property
+    def cloud_by_evidence(self) -> Cloud:
+        """The same as `log_evidence` has it: each seed by its own evidence, and none that has
+        missed what the best one found."""
+        found = torch.tensor(self.by_seed, dtype=torch.float64)
+        kept = found >= found.max() - MISSED
+        return _joined(self.clouds, torch.where(kept, found, -torch.inf))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,16 +148,10 @@ def fit_stream(question: Question, effects: Sequence[Effect], seed: int) -> torc
     return stream(question.seed, zlib.crc32(name.encode()), seed)
 
 
-def _joined(clouds: Sequence[Cloud]) -> Cloud:
-    """Clouds of one target as one.
-
-    Differences of evidence between seeds are mostly noise of the sampler, and each seed has few
-    draws that count, all in one place. Seeds near the best therefore count alike, which keeps
-    what they disagree about in the posterior.
-    """
+def _joined(clouds: Sequence[Cloud], log_share: Float[Tensor, " k"]) -> Cloud:
+    """Clouds of one target as one, in which each has such a share."""
     evidence = [cloud.log_evidence for cloud in clouds]
-    found = torch.tensor(evidence, dtype=torch.float64)
-    share = (found - found.max() + TIED).clamp(-math.inf, 0.0).softmax(0)
+    share = log_share.softmax(0)
     weights = torch.cat([s * cloud.weights for s, cloud in zip(share, clouds, strict=True)])
     stds = torch.tensor([cloud.log_evidence_std for cloud in clouds], dtype=torch.float64)
     positions = torch.cat([cloud.positions for cloud in clouds])

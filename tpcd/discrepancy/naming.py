@@ -1,8 +1,9 @@
 """One round of naming: every candidate effect beside the model so far, the best of them judged.
 
-Every candidate is fitted jointly with theta from the prior, with the same budget as the model
-without it; that model is fitted again from where the best alternatives arrived, since a badly
-fitted base is the main cause of false names. Evidence ranks, and blocks held out may veto.
+Candidates that promise a gain are fitted jointly with theta from the prior, with the same budget
+as the model without them; that model is fitted again from where the best alternatives arrived, and
+from where a quick look at it finds much more, since a badly fitted base is the main cause of false
+names. Evidence ranks, and blocks held out may veto.
 """
 
 from __future__ import annotations
@@ -18,19 +19,15 @@ from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
-from tpcd.discrepancy.nested import NestedGain, nested_gain
-from tpcd.discrepancy.screening import Glance, glance, peak
+from tpcd.discrepancy.promises import looks_at, promised_gains, seen_itself
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     BEATEN,
     CLEAR,
-    ELSEWHERE,
     FRESH,
     IMPROVED,
     PROMISING,
-    TOLD,
     UNDECIDED,
-    WEIGHED,
     WITHIN,
 )
 from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, WIDE_SHAPE, Variant
@@ -68,10 +65,11 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     settings, question = bench.settings, bench.question
     number = len(current.effects) - bench.given + 1
     fresh = FRESH[adequate] if settings.from_prior else 0
-    glances = _glances(bench, current, pool, number, fresh)
+    current, reached = seen_itself(bench, current, fresh)
+    glances = looks_at(bench, current, pool, number, fresh)
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
-    gains = _gains(bench, current, glances, number, fresh)
+    gains = promised_gains(bench, current, glances, number, reached)
     ranked = sorted(glances, key=lambda g: -gains[g.effect.name])[: settings.full_fits]
     chosen = [g for g in ranked if gains[g.effect.name] > PROMISING[adequate]]
     places = {g.effect.name: g.place[None] for g in glances}
@@ -83,13 +81,14 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     fits: list[Fit] = []
     top, rise = -math.inf, 0.0
     for look in chosen:
-        # What full fits have found beyond their looks, this one may find too.
-        if look.log_evidence + rise < top - BEATEN:
-            break
+        # What full fits have found beyond what was promised, this one may find too.
+        promised = max(look.log_evidence, current.log_evidence + gains[look.effect.name])
+        if promised + rise < top - BEATEN:
+            continue
         for fit in each_of(bench, [look.effect], number, fitted):
             fits.append(fit)
             top = max(top, fit.log_evidence)
-            rise = max(rise, fit.log_evidence - look.log_evidence)
+            rise = max(rise, fit.log_evidence - promised)
     near = [
         fitted_again(bench, fit, 1, (current,), places=places[fit.names[-1]])
         if fit.log_evidence > current.log_evidence
@@ -189,43 +188,6 @@ def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
             bench.tell(f"{effect.name} is no longer needed")
             fit = other
     return fit
-
-
-def _glances(
-    bench: Workbench,
-    current: Fit,
-    pool: Sequence[Effect],
-    number: int,
-    fresh: int,
-) -> list[Glance]:
-    """A quick look at every effect, the best first. Also at those that the data hardly excite: what
-    an effect does to nothing it cannot gain."""
-    chosen = [effect for effect in pool if effect.name not in current.names]
-    glances = each_of(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
-    return sorted(glances, key=lambda g: -g.log_evidence)
-
-
-def _gains(
-    bench: Workbench, current: Fit, glances: Sequence[Glance], number: int, fresh: int
-) -> dict[str, float]:
-    """What effects promise to gain: by their look beside one at the model itself, and for the best
-    of them by the draws of the model, unless a look finds much more, as it does where an effect
-    takes the scene elsewhere."""
-    question = bench.question
-    own = bench.attempt(
-        "the look at the model itself failed", lambda: peak(question, current, (), fresh)
-    )
-    reached = current.log_evidence if own is None else own.log_evidence
-    gains = {g.effect.name: g.log_evidence - reached for g in glances}
-    looks = {g.effect.name: g for g in glances[:WEIGHED]}
-
-    def weighed(effect: Effect) -> tuple[str, NestedGain]:
-        return effect.name, nested_gain(question, current, looks[effect.name])
-
-    for name, found in each_of(bench, [g.effect for g in looks.values()], number, weighed):
-        told = found.std < TOLD and gains[name] < found.gain + ELSEWHERE
-        gains[name] = found.gain if told else max(gains[name], found.gain)
-    return gains
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

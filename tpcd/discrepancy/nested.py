@@ -9,24 +9,26 @@ values, x' = x + B (e - e0). Then
 
     Z with / Z without = mean of  L(x', e) p(x') p(e) / (L(x) p(x) q(e)),
 
-where q, from which e is drawn, is the normal density that the curvature gives and some of the
-prior. Where an effect that is there takes the scene elsewhere, these draws do not go along, and
-the estimate is too low; a look from all over the prior (`screening`) tells that.
+where q, from which e is drawn, is a normal density of twice the variance that the curvature gives,
+cut off where the prior ends, and some of the prior. Where an effect that is there takes the scene
+elsewhere, these draws do not go along, and the estimate is too low; a look from all over the prior
+(`screening`) tells that.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tpcd.belief.resampling import systematic_resample
+from tpcd.belief.resampling import effective_sample_size, systematic_resample
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.fit import Fit, Question, fit_stream
 from tpcd.discrepancy.screening import Glance
+from tpcd.discrepancy.settings import FEWEST_DRAWS
 
 DRAWS = 600
 FROM_PRIOR = 0.3
@@ -46,7 +48,7 @@ class NestedGain:
     gain: float
     """Log of the ratio of the evidences; -inf where no draw with the effect has a weight."""
     std: float
-    """Standard error, from what draws of the model differ by."""
+    """Standard error, from what draws of the model differ by; infinite where these are few."""
 
 
 def nested_gain(question: Question, base: Fit, look: Glance) -> NestedGain:
@@ -69,9 +71,10 @@ def _weighed(question: Question, base: Fit, look: Glance) -> NestedGain:
     )
     first = base.prior.dimension
     values, log_density, along = _values(look, with_it, first, generator)
-    chosen = systematic_resample(base.cloud.weights, len(values), generator)
+    cloud = base.cloud_by_evidence
+    chosen = systematic_resample(cloud.weights, len(values), generator)
     chosen = chosen[torch.randperm(len(chosen), generator=generator)]
-    draws, reached = base.cloud.positions[chosen], base.cloud.log_likelihood[chosen]
+    draws, reached = cloud.positions[chosen], cloud.log_likelihood[chosen]
     null = torch.tensor([p.null for p in look.effect.parameters], dtype=torch.float64)
     moved = draws + (values - null) @ along.T
     log_prior = without.log_prior(moved)
@@ -81,7 +84,9 @@ def _weighed(question: Question, base: Fit, look: Glance) -> NestedGain:
     score = torch.cat((moved[:, :-1], own, moved[:, -1:]), dim=-1)
     least = torch.where(torch.isfinite(log_prior), level - HOPELESS, torch.inf)
     log_ratio = with_it.log_likelihood(score, least) - level - log_density
-    return _mean(torch.where(torch.isfinite(log_ratio), log_ratio, -torch.inf), chosen)
+    found = _mean(torch.where(torch.isfinite(log_ratio), log_ratio, -torch.inf), chosen)
+    few = effective_sample_size(cloud.weights) < FEWEST_DRAWS
+    return replace(found, std=math.inf) if few else found
 
 
 def _values(
@@ -122,5 +127,8 @@ def _mean(log_ratio: Float[Tensor, " n"], draw: Int[Tensor, " n"]) -> NestedGain
     place = draw.unique(return_inverse=True)[1]
     sums = torch.zeros(int(place.max()) + 1, dtype=torch.float64).index_add(0, place, ratio)
     mean, often = float(ratio.mean()), place.bincount().double()
+    gain, groups = top + math.log(mean), len(often)
+    if groups < 2:
+        return NestedGain(gain, math.inf)
     error = float((sums - often * mean).norm()) / (mean * len(ratio))
-    return NestedGain(top + math.log(mean), error)
+    return NestedGain(gain, error * math.sqrt(groups / (groups - 1)))

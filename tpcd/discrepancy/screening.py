@@ -2,7 +2,8 @@
 
 Points climb from where the base model arrived, with the effect at its null value and at draws
 from its prior, and a few from all over the prior, since without the effect the base model may have
-gone astray. The best of them says which candidates deserve the full fit.
+gone astray. Beside the same look at the model itself, the best of them says what an effect promises
+to gain.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def peak(question: Question, base: Fit, more: tuple[Effect, ...], fresh: int) ->
     effects = (*base.effects, *more)
     names = tuple(e.name for e in effects)
     prior = question.scene.with_effects(effects)
-    key = (question.fingerprint, names, prior.low, prior.high, base.fingerprint, fresh)
+    key = ("peak", question.fingerprint, names, prior.low, prior.high, base.fingerprint, fresh)
     new = len(effect_parameters(more))
     return question.memory.recall(key, Peak, lambda: _climbed(question, base, prior, new, fresh))
 

@@ -1,0 +1,67 @@
+"""What effects promise to gain beside a model, before any of them is fitted in full."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tpcd.discrepancy.fit import Fit
+from tpcd.discrepancy.nested import nested_gain
+from tpcd.discrepancy.screening import Glance, Peak, glance, peak
+from tpcd.discrepancy.settings import ELSEWHERE, TOLD, WEIGHED
+from tpcd.discrepancy.workbench import Workbench, each_of, fitted_again
+from tpcd.effects.protocol import Effect
+
+
+def seen_itself(bench: Workbench, current: Fit, fresh: int) -> tuple[Fit, float]:
+    """The model so far, fitted again where a quick look at it finds much more than its fits, and
+    the log evidence by that look."""
+
+    def look(fit: Fit) -> Peak | None:
+        what = "the look at the model itself failed"
+        return bench.attempt(what, lambda: peak(bench.question, fit, (), fresh))
+
+    own = look(current)
+    if own is not None and own.log_evidence > current.log_evidence + ELSEWHERE:
+        current = fitted_again(bench, current, 13, (current,), places=own.place[None])
+        own = look(current)
+    return current, current.log_evidence if own is None else own.log_evidence
+
+
+def looks_at(
+    bench: Workbench,
+    current: Fit,
+    pool: Sequence[Effect],
+    number: int,
+    fresh: int,
+) -> list[Glance]:
+    """A quick look at every effect, the best first. Also at those that the data hardly excite: what
+    an effect does to nothing it cannot gain."""
+    chosen = [effect for effect in pool if effect.name not in current.names]
+    glances = each_of(bench, chosen, number, lambda e: glance(bench.question, current, e, fresh))
+    return sorted(glances, key=lambda g: -g.log_evidence)
+
+
+def promised_gains(
+    bench: Workbench, current: Fit, glances: Sequence[Glance], number: int, reached: float
+) -> dict[str, float]:
+    """What effects promise to gain: by their look beside what one at the model itself reached, and
+    for the best of them by the draws of the model, unless these are few or a look finds much more,
+    as it does where an effect takes the scene elsewhere."""
+    gains = {g.effect.name: g.log_evidence - reached for g in glances}
+    asked: set[str] = set()
+    next_ones = list(glances[:WEIGHED])
+    while next_ones:
+        for look in next_ones:
+            name = look.effect.name
+            found = bench.attempt(
+                f"the gain of {name} by draws failed in round {number}",
+                lambda look=look: nested_gain(bench.question, current, look),
+            )
+            if found is not None:
+                told = found.std < TOLD and gains[name] < found.gain + ELSEWHERE
+                gains[name] = found.gain if told else max(gains[name], found.gain)
+        asked |= {look.effect.name for look in next_ones}
+        # Nothing comes before those that were weighed without being weighed itself.
+        first = sorted(glances, key=lambda g: -gains[g.effect.name])[: bench.settings.full_fits]
+        next_ones = [g for g in first if g.effect.name not in asked and gains[g.effect.name] > 0]
+    return gains

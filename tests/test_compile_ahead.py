@@ -16,11 +16,12 @@ import torch
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief import kernel as filtered, mixture_kernel
 from tpcd.compile_ahead import compile_loops
+from tpcd.contact import scene_from_parameters
 from tpcd.effects.catalogue import find_effect
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
-from tpcd.simulator import kernel
+from tpcd.simulator import kernel, simulate_step
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -35,6 +36,9 @@ for effects in ((), (find_effect("wall_compliance"), find_effect("grasp_complian
     settings = EstimatorSettings(sampler=SamplerSettings(particles=50), effects=effects)
     *_, last = estimate(episode, load_prior("ycb-rich"), generator, settings)
     ContactPredictor(last.belief).predict(episode.poses[:1], episode.commands[1:2])
+    belief = last.belief
+    one = scene_from_parameters(belief.prior.shape, belief.prior.parameters_of(belief.vectors[:1]))
+    simulate_step(one, episode.poses[:2], episode.commands[1:], episode.stiffness)
 print(before, [len(loop.signatures) for loop in loops])
 """
 

@@ -233,7 +233,7 @@ def request_of(
     mine = torch.arange(outlines.numel()).reshape(outlines).expand(scene.batch_shape).reshape(-1)
     return Request(
         mine[owner].numpy(),
-        owner.numpy(),
+        owner.contiguous().numpy(),
         _flat(stiffness.detach(), 3),
         _flat(start.detach(), 3),
         _flat((start if previous is None else previous).detach(), 3),

@@ -352,6 +352,37 @@ def test_a_look_that_finds_more_than_the_fits_has_the_model_fitted_from_there(
     assert not begun
 
 
+@pytest.mark.parametrize(
+    ("draws", "std", "closer"),
+    [(7.0, 0.4, 0), (4.5, 0.4, 1), (9.5, 0.4, 1), (7.0, 1.1, 1)],
+)
+def test_what_draws_and_fits_agree_about_is_not_looked_at_more_closely(
+    draws: float, std: float, closer: int, episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gain of 7 is undecided by itself."""
+    bench = bench_of(episode)
+    asked: list[Fit] = []
+
+    def look_closer(bench: Workbench, current: Fit, near: list[Fit]) -> tuple[Fit, list[Fit]]:
+        asked.append(near[0])
+        return current, near
+
+    def fit(question: Question, effects, seeds, *_, **__) -> Fit:
+        return Fit(tuple(effects), question.step, question.scene, (107.0, 107.0), ())
+
+    looks = looks_of({CATALOGUE[0].name: 108.0})
+    monkeypatch.setattr(naming, "looks_at", lambda *_: looks)
+    monkeypatch.setattr(promises, "peak", lambda *_: looks_of({CATALOGUE[0].name: 100.0})[0])
+    monkeypatch.setattr(promises, "nested_gain", lambda *_: NestedGain(draws, std))
+    monkeypatch.setattr(naming, "fit_model", fit)
+    monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
+    monkeypatch.setattr(naming, "looked_closer", look_closer)
+    monkeypatch.setattr(naming, "stands", lambda *_: (False, ""))
+    base = Fit((), bench.question.step, bench.question.scene, (100.0, 100.0), ())
+    naming.name_one(bench, base, CATALOGUE[:1], True)
+    assert len(asked) == closer
+
+
 def test_where_no_look_at_the_model_itself_is_had_its_fits_stand_for_it(
     episode, monkeypatch: pytest.MonkeyPatch
 ) -> None:

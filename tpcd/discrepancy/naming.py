@@ -19,7 +19,7 @@ from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
-from tpcd.discrepancy.promises import looks_at, promised_gains, seen_itself
+from tpcd.discrepancy.promises import draws_agree, looks_at, promised_gains, seen_itself
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     BEATEN,
@@ -108,7 +108,8 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
             near = sorted([*again, *near[2:]], key=lambda fit: -fit.log_evidence)
     lead = near[0].log_evidence - current.log_evidence if near else -math.inf
     agreed = bool(near) and second_best(near[0]) >= current.log_evidence + settings.least_gain
-    if lead > UNDECIDED[adequate] and not (lead >= CLEAR and agreed):
+    undecided = lead > UNDECIDED[adequate] and not (lead >= CLEAR and agreed)
+    if undecided and not draws_agree(bench, current, near[0], glances):
         current, near = looked_closer(bench, current, near)
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)

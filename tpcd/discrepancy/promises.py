@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from tpcd.discrepancy.fit import Fit
 from tpcd.discrepancy.nested import nested_gain
 from tpcd.discrepancy.screening import Glance, Peak, glance, peak
-from tpcd.discrepancy.settings import ELSEWHERE, TOLD, WEIGHED
+from tpcd.discrepancy.settings import AGREED, ELSEWHERE, TOLD, WEIGHED
 from tpcd.discrepancy.workbench import Workbench, each_of, fitted_again
 from tpcd.effects.protocol import Effect
 
@@ -65,3 +65,14 @@ def promised_gains(
         first = sorted(glances, key=lambda g: -gains[g.effect.name])[: bench.settings.full_fits]
         next_ones = [g for g in first if g.effect.name not in asked and gains[g.effect.name] > 0]
     return gains
+
+
+def draws_agree(bench: Workbench, current: Fit, best: Fit, glances: Sequence[Glance]) -> bool:
+    """Whether the draws of the model so far tell the same gain of the best candidate as the fits
+    of both: two ways, of which the one knows only scenes of that model and the other has searched
+    twice, have then missed nothing that matters."""
+    look = next(g for g in glances if g.effect.name == best.names[-1])
+    what = f"the gain of {look.effect.name} by draws failed"
+    found = bench.attempt(what, lambda: nested_gain(bench.question, current, look))
+    lead = best.log_evidence - current.log_evidence
+    return found is not None and found.std < AGREED / 2 and abs(found.gain - lead) < AGREED

@@ -26,6 +26,13 @@ PLACES = 16
 """Places of the base fit from which points climb, for an effect of one parameter."""
 MOST_PLACES = 48
 ROUNDS = 4
+FURTHER = 3
+"""Times at most that so many rounds more are climbed"""
+GOING_ON = 8
+"""by so many of the points,"""
+RISING = 1.0
+"""while any of them still rises by so much: where friction changes hands a climb is slow, and one
+that is behind may overtake."""
 FRESH_ROUNDS = 2
 KEPT = 6
 """Points from all over the prior that go on climbing."""
@@ -84,6 +91,11 @@ def _climbed(question: Question, base: Fit, prior: ParameterPrior, new: int, fre
         begun = climb(target, begun, FRESH_ROUNDS)
         start = start.beside(begun[begun.height.topk(min(KEPT, fresh)).indices])
     arrived = climb(target, start, ROUNDS)
+    for _ in range(FURTHER):
+        before = arrived[arrived.height.topk(min(GOING_ON, len(arrived.height))).indices]
+        arrived = climb(target, before, ROUNDS)
+        if not bool((arrived.height > before.height + RISING).any()):
+            break
     best = arrived[arrived.height.topk(min(2, len(arrived.height))).indices].surveyed(target)
     information = best.information
     width = -0.5 * torch.linalg.slogdet(information).logabsdet

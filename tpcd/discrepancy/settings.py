@@ -26,19 +26,21 @@ PROMISING = {True: 1.0, False: 0.0}
 and where it does not."""
 BEATEN = 25.0
 """A candidate whose quick look is so far below the best full fit gets none."""
-WITHIN = 8.0
-"""Candidates whose gain is so close to the best get a second seed."""
+WITHIN = 5.0
+"""Candidates whose gain is so close to the best get a second seed: what comes within `AMBIGUOUS` is
+told, and seeds differ by a nat or two."""
 IMPROVED = 2.0
 """Gain of the base model fitted again from which the best candidates are fitted again too."""
 CLOSER = 3
 """Times the places from which points climb where a candidate that neither wins nor loses clearly is
-fitted again."""
+fitted again, unless draws agree with the fits."""
 CLOSER_SEEDS = (30, 31, 32)
 """Seeds of that, of which further ones are used while the search still climbs."""
 CLIMBING = 2.0
 """Gain of log evidence with which a search that is made again still climbs."""
 AGREED = 2.0
-"""A second seed may miss the gain that is asked for by so much."""
+"""A second seed may miss the gain that is asked for by so much, and the gain by draws may differ
+by so much from that of the fits where neither has missed anything."""
 UNDECIDED = {True: 2.0, False: -10.0}
 """Gain from which it does not lose clearly: where the model explains the data, and where not."""
 AMBIGUOUS = 3.0

@@ -11,6 +11,7 @@ from diagnosis_bench import CATALOGUE, bench_of, far_from_the_wall
 
 from tpcd.data.episode import Episode
 from tpcd.discrepancy import naming, promises
+from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.nested import NestedGain
 from tpcd.discrepancy.screening import Glance
@@ -59,6 +60,7 @@ def test_what_does_not_promise_to_gain_is_not_fitted(
     monkeypatch.setattr(
         promises, "nested_gain", lambda *a: NestedGain(by_draws[a[-1].effect.name], std)
     )
+    monkeypatch.setattr(Workbench, "adequacy", lambda *_: Adequacy(0.1, 0.01, 0.01, ()))
     monkeypatch.setattr(naming, "fit_model", fit)
     monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
     monkeypatch.setattr(naming, "looked_closer", lambda bench, current, near: (current, near))
@@ -204,3 +206,40 @@ def test_where_no_look_at_the_model_itself_is_had_its_fits_stand_for_it(
     gains = promises.promised_gains(bench, base, looks, 1, 100.0)
     assert gains[CATALOGUE[0].name] == 3.0
     assert any("the gain of floor_compliance by draws failed" in note for note in bench.notes)
+
+
+@pytest.mark.parametrize(
+    ("adequate", "p", "quick", "full"),
+    [(False, 1e-6, 3, 1), (False, 0.01, 0, 0), (True, 0.5, 0, 0)],
+)
+def test_where_something_is_left_and_nothing_promises_a_gain_all_have_a_quick_fit(
+    adequate: bool, p: float, quick: int, full: int, episode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an effect that takes the scene far away looks and draws know nothing."""
+    bench = bench_of(episode)
+    begun: list[tuple[str, ...]] = []
+    tried: list[str] = []
+
+    def quickly(question: Question, effects, seeds, start, passes: int) -> Fit:
+        tried.append(effects[-1].name)
+        assert passes == 1 and question.sampler.draws == promises.QUICK["draws"]
+        found = 109.0 if effects[-1] is CATALOGUE[1] else 99.0
+        return Fit(tuple(effects), question.step, question.scene, (found,), ())
+
+    def fit(question: Question, effects, seeds, start, **_) -> Fit:
+        begun.append(tuple(one.names[-1] for one in start if one.names))
+        return Fit(tuple(effects), question.step, question.scene, (100.0,), ())
+
+    looks = looks_of({effect.name: 95.0 for effect in CATALOGUE})
+    monkeypatch.setattr(naming, "looks_at", lambda *_: looks)
+    monkeypatch.setattr(promises, "peak", lambda *_: looks_of({CATALOGUE[0].name: 99.0})[0])
+    monkeypatch.setattr(promises, "nested_gain", lambda *_: NestedGain(-4.0, 0.1))
+    monkeypatch.setattr(Workbench, "adequacy", lambda *_: Adequacy(0.1, p, p, ()))
+    monkeypatch.setattr(promises, "fit_model", quickly)
+    monkeypatch.setattr(naming, "fit_model", fit)
+    monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
+    monkeypatch.setattr(naming, "looked_closer", lambda bench, current, near: (current, near))
+    base = Fit((), bench.question.step, bench.question.scene, (100.0,), ())
+    naming.name_one(bench, base, CATALOGUE, adequate)
+    assert len(tried) == quick
+    assert begun == [(CATALOGUE[1].name,)] * full

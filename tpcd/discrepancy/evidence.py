@@ -44,26 +44,27 @@ def fit_model(
     step: StepSettings | None = None,
     places: Float[Tensor, "k s"] | None = None,
     power: float = 1.0,
+    passes: int = PASSES,
 ) -> Fit:
     """Fit the base model with these effects; seeds are told apart by their numbers.
 
     Besides the prior, a fit also starts from where those in `start` arrived, and from `places`.
     With a `power` of the likelihood below 1 the posterior is wider, and what stands for its
-    evidence is none.
+    evidence is none. `passes` is how often draws are made again at most.
     """
     effects = tuple(effects)
     prior = question.scene.with_effects(effects)
     step = question.step if step is None else step
     target = ContactTarget(prior, question.misfit, step, question.history, power)
     names = tuple(effect.name for effect in effects)
-    model = (question.fingerprint, names, prior.low, prior.high, step, power)
+    model = (question.fingerprint, names, prior.low, prior.high, step, power, passes)
     begun = tuple(fit.fingerprint for fit in start)
     clouds = []
     for seed in seeds:
         generator = fit_stream(question, effects, seed)
 
         def work(generator: torch.Generator = generator) -> Cloud:
-            return _fitted(target, question.sampler, start, places, generator)
+            return _fitted(target, question.sampler, start, places, generator, passes)
 
         clouds.append(question.memory.recall((*model, begun, places, seed), Cloud, work))
     return Fit(effects, step, prior, tuple(c.log_evidence for c in clouds), tuple(clouds))
@@ -75,6 +76,7 @@ def _fitted(
     start: Sequence[Fit],
     places: Float[Tensor, "k s"] | None,
     generator: torch.Generator,
+    passes: int,
 ) -> Cloud:
     """The particles of one seed."""
     begin = start_cloud(target.sample(sampler.particles, generator))
@@ -83,12 +85,16 @@ def _fitted(
         remembered.append(places)
     if remembered:
         begin = replace(begin, modes=torch.cat(remembered))
-    pool = draw_again(begin, target, sampler, generator)
+    pool = draw_again(begin, target, sampler, generator, passes)
     return pool.cloud(sampler.particles, generator)
 
 
 def draw_again(
-    begin: Cloud, target: Target, sampler: SamplerSettings, generator: torch.Generator
+    begin: Cloud,
+    target: Target,
+    sampler: SamplerSettings,
+    generator: torch.Generator,
+    passes: int = PASSES,
 ) -> Pool:
     """Draws that are made again and again, each time from where the draws before lie, and count
     together where they find the same, while the evidence changes or rests on few of them; once
@@ -101,7 +107,7 @@ def draw_again(
         return draw_pool(begin, target, 1, sampler, generator)
     rough = draw_pool(begin, target, 1, replace(sampler, **FIRST), generator)
     pool, before = rough, rough.log_evidence
-    for count in range(PASSES):
+    for count in range(passes):
         cloud = pool.cloud(sampler.particles, generator)
         found = draw_pool(cloud, target, 1, sampler, generator)
         change = found.log_evidence - before

@@ -19,7 +19,13 @@ from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
-from tpcd.discrepancy.promises import draws_agree, looks_at, promised_gains, seen_itself
+from tpcd.discrepancy.promises import (
+    draws_agree,
+    looks_at,
+    promised_gains,
+    quick_fits,
+    seen_itself,
+)
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     BEATEN,
@@ -70,13 +76,20 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
     gains = promised_gains(bench, current, glances, number, reached)
+    quick: dict[str, Fit] = {}
+    lost = settings.from_prior and max(gains.values(), default=0.0) <= PROMISING[False]
+    if lost and not adequate and not bench.adequacy(current).adequate(settings.level):
+        quick = quick_fits(bench, current, glances, number)
+        for name, fit in quick.items():
+            gains[name] = max(gains[name], fit.log_evidence - current.log_evidence)
     ranked = sorted(glances, key=lambda g: -gains[g.effect.name])[: settings.full_fits]
     chosen = [g for g in ranked if gains[g.effect.name] > PROMISING[adequate]]
     places = {g.effect.name: g.place[None] for g in glances}
 
     def fitted(effect: Effect) -> Fit:
         effects, found = (*current.effects, effect), places[effect.name]
-        return fit_model(question, effects, (0,), start=(current,), places=found)
+        begun = [quick[effect.name]] if effect.name in quick else []
+        return fit_model(question, effects, (0,), start=(current, *begun), places=found)
 
     fits: list[Fit] = []
     top, rise = -math.inf, 0.0

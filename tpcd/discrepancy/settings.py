@@ -24,6 +24,10 @@ ELSEWHERE = 4.0
 PROMISING = {True: 1.0, False: 0.0}
 """Gain that a candidate has to promise for a full fit: where the model explains the data as it is,
 and where it does not."""
+QUICK = {"draws": 300, "flat_draws": 200, "flat_rounds": 2}
+"""Budget of the quick fits, in one pass, where something is left and nothing promises a gain,"""
+QUICK_SEED = 50
+"""and their seed."""
 BEATEN = 25.0
 """A candidate whose quick look is so far below the best full fit gets none."""
 WITHIN = 5.0

@@ -29,7 +29,7 @@ QUICK = {"draws": 300, "flat_draws": 200, "flat_rounds": 2}
 QUICK_SEED = 50
 """and their seed."""
 BEATEN = 25.0
-"""A candidate whose quick look is so far below the best full fit gets none."""
+"""A candidate that promises so much less than the best full fit gets none."""
 WITHIN = 5.0
 """Candidates whose gain is so close to the best get a second seed: what comes within `AMBIGUOUS` is
 told, and seeds differ by a nat or two."""
@@ -72,7 +72,7 @@ REPORTED_SEEDS = (40, 41, 42, 43)
 ENOUGH_DRAWS = 50
 """Effective number of draws with which no further seed is used."""
 FEWEST_DRAWS = 5
-"""Effective number of draws below which intervals are said to be unsure."""
+"""Effective number of draws below which intervals are said to be unsure, and draws tell no gain."""
 
 
 @dataclass(frozen=True)

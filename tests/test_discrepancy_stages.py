@@ -11,7 +11,7 @@ from diagnosis_bench import CATALOGUE, SETTINGS, bench_of, far_from_the_wall
 
 from tpcd.belief.cloud import start_cloud
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import naming, promises, search, workbench
+from tpcd.discrepancy import naming, promises, pruning, search, workbench
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
@@ -52,6 +52,8 @@ def test_the_catalogue_is_asked_once_more_beside_a_formula(
 
     monkeypatch.setattr(search, "name_one", named)
     monkeypatch.setattr(search, "outdone", swapped)
+    for module in (search, pruning):
+        monkeypatch.setattr(module, "needless", lambda *_: [])
     monkeypatch.setattr(search, "better_base", lambda bench, current, *_: (current, None))
     monkeypatch.setattr(search, "find_confusions", lambda *_: None)
     monkeypatch.setattr(search, "step_halving", lambda *_: 0.0)

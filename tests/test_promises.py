@@ -15,13 +15,19 @@ from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.nested import NestedGain
 from tpcd.discrepancy.screening import Glance
-from tpcd.discrepancy.settings import BEATEN
+from tpcd.discrepancy.settings import BEATEN, FEW_DRAWS
 from tpcd.discrepancy.workbench import Workbench
 
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
     return far_from_the_wall()
+
+
+@pytest.fixture(autouse=True)
+def worth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models are fitted with many draws, also those that are made up and have none."""
+    monkeypatch.setattr(Fit, "worth", 100.0)
 
 
 def looks_of(worth: dict[str, float]) -> list[Glance]:
@@ -99,6 +105,13 @@ def test_what_looks_far_worse_than_a_full_fit_gets_none(
     naming.name_one(bench, base, CATALOGUE, False)
     assert fitted == [effect.name for effect in CATALOGUE[:2]]
     assert 100.0 - 80.0 < BEATEN < 100.0 - 70.0
+    # Beside a model that rests on few draws looks are worth little, unless it leaves nothing.
+    for adequate, count in ((False, 3), (True, 2)):
+        fitted.clear()
+        monkeypatch.setattr(Fit, "worth", FEW_DRAWS - 1.0)
+        naming.name_one(bench, base, CATALOGUE, adequate)
+        assert fitted == [effect.name for effect in CATALOGUE[:count]]
+    monkeypatch.setattr(Fit, "worth", FEW_DRAWS)
     # Where a full fit finds more than its look, another one may too.
     fitted.clear()
     looks[0] = replace(looks[0], log_evidence=90.0)

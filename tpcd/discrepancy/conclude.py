@@ -159,7 +159,7 @@ def _reported(bench: Workbench, question: Question, fit: Fit, seeds: Sequence[in
     two of the seeds, and on while few draws count."""
     wide: Fit | None = None
     for count, seed in enumerate(seeds):
-        if wide is not None and count >= 2 and _worth(wide) >= ENOUGH_DRAWS:
+        if wide is not None and count >= 2 and wide.worth >= ENOUGH_DRAWS:
             break
         more = bench.attempt(
             "intervals are too narrow, the last fit failed",
@@ -171,18 +171,13 @@ def _reported(bench: Workbench, question: Question, fit: Fit, seeds: Sequence[in
             break
         wide = more if wide is None else joined_fit(wide, more)
     wide = wide or fit
-    if _worth(wide) < FEWEST_DRAWS:
+    if wide.worth < FEWEST_DRAWS:
         model = " and ".join(fit.names) or "the model without effects"
         bench.warn(
-            f"the posterior of {model} rests on about {_worth(wide):.0f} draws, expected at least"
+            f"the posterior of {model} rests on about {wide.worth:.0f} draws, expected at least"
             f" {FEWEST_DRAWS}; sizes are less sure than their intervals say"
         )
     return replace(posterior(question, wide), log_evidence=fit.log_evidence)
-
-
-def _worth(fit: Fit) -> float:
-    """Effective number of the draws that a posterior was chosen from."""
-    return fit.cloud.log_evidence_std**-2 if fit.cloud.log_evidence_std > 0 else math.inf
 
 
 def _without_effects(bench: Workbench, found: Findings, share: float) -> Findings:

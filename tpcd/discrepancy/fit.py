@@ -126,6 +126,12 @@ class Fit:
         return _log_mean(self.by_seed)
 
     @property
+    def worth(self) -> float:
+        """Effective number of the draws that the posterior was chosen from."""
+        std = self.cloud.log_evidence_std
+        return std**-2 if std > 0 else math.inf
+
+    @property
     def spread(self) -> float:
         """Largest difference of the log evidence between seeds; infinite for a single one."""
         return max(self.by_seed) - min(self.by_seed) if len(self.by_seed) > 1 else math.inf

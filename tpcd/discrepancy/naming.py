@@ -28,8 +28,10 @@ from tpcd.discrepancy.promises import (
 )
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
+    ASTRAY,
     BEATEN,
     CLEAR,
+    FEW_DRAWS,
     FRESH,
     IMPROVED,
     PROMISING,
@@ -84,6 +86,7 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
             gains[name] = max(gains[name], fit.log_evidence - current.log_evidence)
     ranked = sorted(glances, key=lambda g: -gains[g.effect.name])[: settings.full_fits]
     chosen = [g for g in ranked if gains[g.effect.name] > PROMISING[adequate]]
+    astray = not adequate and current.worth < FEW_DRAWS
     places = {g.effect.name: g.place[None] for g in glances}
 
     def fitted(effect: Effect) -> Fit:
@@ -96,7 +99,7 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     for look in chosen:
         # What full fits have found beyond what was promised, this one may find too.
         promised = max(look.log_evidence, current.log_evidence + gains[look.effect.name])
-        if promised + rise < top - BEATEN:
+        if promised + rise < top - BEATEN and not astray:
             continue
         for fit in each_of(bench, [look.effect], number, fitted):
             fits.append(fit)
@@ -107,7 +110,7 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
         if fit.log_evidence > current.log_evidence
         else fit
         for fit in fits
-        if fit.log_evidence > top - WITHIN
+        if fit.log_evidence > top - (ASTRAY if astray else WITHIN)
     ]
     near.sort(key=lambda fit: -fit.log_evidence)
     if settings.base_refit and near:
@@ -185,23 +188,6 @@ def better_base(
         gain, outcome = shown.log_evidence - current.log_evidence, "accepted" if taken else ""
         bench.candidates.append(Candidate(variant.name, 0, gain, shown.by_seed, outcome))
     return current, chosen
-
-
-def pruned(bench: Workbench, fit: Fit, but_last: bool = True) -> Fit:
-    """The model without effects that it no longer needs; the last one is not asked about."""
-    own = fit.effects[bench.given :]
-    for effect in own[:-1] if but_last else own:
-        less = tuple(e for e in fit.effects if e is not effect)
-        other = bench.attempt(
-            f"the model without {effect.name} failed",
-            lambda less=less, fit=fit: fit_model(bench.question, less, (0, 1), start=(fit,)),
-        )
-        if other is None:
-            continue
-        if fit.log_evidence - other.log_evidence < bench.price((effect,)):
-            bench.tell(f"{effect.name} is no longer needed")
-            fit = other
-    return fit
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

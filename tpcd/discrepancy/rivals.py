@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit
-from tpcd.discrepancy.naming import pruned
+from tpcd.discrepancy.pruning import pruned
 from tpcd.discrepancy.screening import Glance, glance
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,

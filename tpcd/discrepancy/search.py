@@ -23,7 +23,8 @@ from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.memory import Memory
-from tpcd.discrepancy.naming import better_base, find_confusions, name_one, pruned
+from tpcd.discrepancy.naming import better_base, find_confusions, name_one
+from tpcd.discrepancy.pruning import needless, pruned
 from tpcd.discrepancy.report_parts import detection_limits
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import AMBIGUOUS, FEWEST_ROWS, DiagnosisSettings
@@ -125,10 +126,11 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     variants: list[Variant] = []
     close: tuple[Close, ...] = ()
     asked: set[tuple[str, ...]] = set()
+    gone: set[str] = set()  # added, and then not needed: it would be added again
     stages = [settings.catalogue, FORMULAS]
     stage = 0
     while stage < len(stages):
-        pool = stages[stage]
+        pool = [effect for effect in stages[stage] if effect.name not in gone]
         while len(current.effects) - bench.given < settings.most_effects:
             first = len(current.effects) == bench.given
             found = name_one(bench, current, pool, bench.adequacy(current).adequate(0.05))
@@ -149,16 +151,24 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if found.best is None:
                 break
             current = pruned(bench, found.best)
+            if found.best.effects[-1] not in current.effects:
+                gone.add(found.best.names[-1])
+                base = current if first else base
+                pool = [effect for effect in pool if effect.name not in gone]
+                continue
             kept = _carried_on(bench, close, current) if current is found.best else ()
             close = (*kept, *found.close)
         explained = _explains(bench, current)
         found_some = len(current.effects) > bench.given
-        if found_some and pool is not FORMULAS and current.names not in asked:
+        if found_some and stages[stage] is not FORMULAS and current.names not in asked:
             asked.add(current.names)
             rival = outdone(bench, base, current, explained)
             close = rival.close if rival.best else (*close, *rival.close)
-            current = rival.best or rival.base
-            if rival.best:
+            current = rival.best or pruned(bench, rival.base, needless(bench, rival.base))
+            if not rival.best and current is not rival.base:
+                gone |= set(rival.base.names) - set(current.names)
+                base = base if len(current.effects) > bench.given else current
+            if rival.best or current is not rival.base:
                 stage = 0
                 continue
         if explained:
@@ -213,7 +223,7 @@ def _taken(
     if number == 1:
         bench.glances.clear()
     bench.candidates[:] = [c for c in bench.candidates if c.round < number]
-    fit = pruned(bench, fit, but_last=False)
+    fit = pruned(bench, fit, fit.effects[bench.given :])
     base = fit if len(fit.effects) == bench.given else fit_well(bench, effects, start=(fit,))
     _tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
     return base, fit

@@ -33,6 +33,11 @@ BEATEN = 25.0
 WITHIN = 5.0
 """Candidates whose gain is so close to the best get a second seed: what comes within `AMBIGUOUS` is
 told, and seeds differ by a nat or two."""
+FEW_DRAWS = 10
+"""Effective number of draws of a model below which, where it leaves something, what promises any
+gain beside it is fitted: its search has gone astray, and so have looks from where it arrived,"""
+ASTRAY = 25.0
+"""and candidates so close to the best get a second seed: the first may have missed as much."""
 IMPROVED = 2.0
 """Gain of the base model fitted again from which the best candidates are fitted again too."""
 CLOSER = 3

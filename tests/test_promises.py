@@ -112,6 +112,8 @@ def test_what_looks_far_worse_than_a_full_fit_gets_none(
         naming.name_one(bench, base, CATALOGUE, adequate)
         assert fitted == [effect.name for effect in CATALOGUE[:count]]
     monkeypatch.setattr(Fit, "worth", FEW_DRAWS)
+    # A round that is made again takes the place of the one before.
+    assert sorted(c.name for c in bench.candidates) == sorted(worth)
     # Where a full fit finds more than its look, another one may too.
     fitted.clear()
     looks[0] = replace(looks[0], log_evidence=90.0)

@@ -127,6 +127,9 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     undecided = lead > UNDECIDED[adequate] and not (lead >= CLEAR and agreed)
     if undecided and not draws_agree(bench, current, near[0], glances):
         current, near = looked_closer(bench, current, near)
+    names = [g.effect.name for g in glances]
+    # A round that is made again, since an effect has gone, takes the place of the one before.
+    bench.candidates[:] = [c for c in bench.candidates if c.round != number or c.name not in names]
     for g in glances:
         full = next((f for f in (*near, *fits) if f.names[-1] == g.effect.name), None)
         gain = gains[g.effect.name]

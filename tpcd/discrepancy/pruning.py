@@ -19,7 +19,9 @@ def pruned(bench: Workbench, fit: Fit, asked: Sequence[Effect] | None = None) ->
     """The model without those of the `asked` effects that it no longer needs; without these all
     but the last are asked about, and the last where its size may be none."""
     own = fit.effects[bench.given :]
-    for effect in (*own[:-1], *needless(bench, fit)) if asked is None else asked:
+    if asked is None:
+        asked = own[:-1] + tuple(e for e in needless(bench, fit) if e in own[-1:])
+    for effect in asked:
         if effect not in fit.effects:
             continue
         less = tuple(e for e in fit.effects if e is not effect)

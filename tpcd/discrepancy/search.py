@@ -154,6 +154,8 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if found.best.effects[-1] not in current.effects:
                 gone.add(found.best.names[-1])
                 base = current if first else base
+                least = current.log_evidence - AMBIGUOUS
+                close = tuple(one for one in close if one.fit.log_evidence > least)
                 pool = [effect for effect in pool if effect.name not in gone]
                 continue
             kept = _carried_on(bench, close, current) if current is found.best else ()
@@ -168,6 +170,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if not rival.best and current is not rival.base:
                 gone |= set(rival.base.names) - set(current.names)
                 base = base if len(current.effects) > bench.given else current
+                close = ()
             if rival.best or current is not rival.base:
                 stage = 0
                 continue

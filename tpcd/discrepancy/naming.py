@@ -210,4 +210,4 @@ def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) ->
         for fit in near[1:]
         if fit.log_evidence > best.log_evidence - AMBIGUOUS
     )
-    return Round(current, best if accepted else None, close)
+    return Round(current, best if accepted else None, close, best)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
@@ -30,6 +30,7 @@ from tpcd.discrepancy.workbench import (
     Round,
     Workbench,
     each_of,
+    gave_way,
     looked_closer,
     stands,
 )
@@ -179,13 +180,8 @@ def _note(bench: Workbench, rival: _Rival, fit: Fit, taken: bool, reason: str) -
     outcome = f"{'accepted' if taken else 'rejected'} in place of {' and '.join(names)}: {reason}"
     outcome += f" of {rival.price:.0f} asked"
     if taken:
-        bench.candidates[:] = [
-            replace(c, outcome=f"{c.outcome}; gave way to {formula}")
-            if c.name in names and c.outcome.startswith("accepted")
-            else c
-            for c in bench.candidates
-            if c.round <= number
-        ]
+        earlier = [c for c in bench.candidates if c.round <= number]
+        bench.candidates[:] = gave_way(earlier, names, formula)
     gain = fit.log_evidence - rival.without.log_evidence
     bench.candidates.append(Candidate(formula, number, gain, fit.by_seed, outcome))
     bench.tell(f"{formula} {outcome}")

@@ -21,6 +21,7 @@ from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.exchange import Asked, exchanged
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import better_base, find_confusions, name_one
@@ -126,6 +127,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     variants: list[Variant] = []
     close: tuple[Close, ...] = ()
     asked: set[tuple[str, ...]] = set()
+    asked_instead: Asked = set()
     gone: set[str] = set()  # added, and then not needed: it would be added again
     stages = [settings.catalogue, FORMULAS]
     stage = 0
@@ -149,7 +151,11 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if first:
                 base = current
             if found.best is None:
-                break
+                swap = exchanged(bench, found, close, asked_instead)
+                close, current = swap.close, swap.best or current
+                if swap.best is None:
+                    break
+                continue
             current = pruned(bench, found.best)
             if found.best.effects[-1] not in current.effects:
                 gone.add(found.best.names[-1])
@@ -194,7 +200,7 @@ def _against(bench: Workbench, found: Round, base: Fit) -> Round:
     """A round beside a base model that is fitted better, of which its best may gain too little."""
     best = found.best
     if best is None:
-        return Round(base)
+        return replace(found, base=base)
     gain = best.log_evidence - base.log_evidence
     if gain >= bench.price(best.effects[-1:]):
         return replace(found, base=base)
@@ -204,7 +210,7 @@ def _against(bench: Workbench, found: Round, base: Fit) -> Round:
         replace(c, outcome=outcome) if (c.name, c.round) == place else c for c in bench.candidates
     ]
     bench.tell(f"round {place[1]}: {place[0]} {outcome}")
-    return Round(base)
+    return Round(base, tried=best)
 
 
 def _doubtful(found: Round, explained: bool) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -104,6 +104,8 @@ class Round:
     """The model with one more effect, where one is accepted."""
     close: tuple[Close, ...] = ()
     """What explains the data about as well as that."""
+    tried: Fit | None = None
+    """The best model with one more effect, accepted or not."""
 
 
 def fit_well(bench: Workbench, effects: Sequence[Effect], start: Sequence[Fit] = ()) -> Fit:
@@ -181,6 +183,16 @@ def stands(
     if held is None:
         return False, f"{reason}, not told on blocks held out"
     return held > 0, f"{reason}, held-out gain at least {held:+.2f} a transition"
+
+
+def gave_way(candidates: Iterable[Candidate], names: Sequence[str], to: str) -> list[Candidate]:
+    """Candidates, of which the accepted ones of these names gave way to another effect."""
+    return [
+        replace(c, outcome=f"{c.outcome}; gave way to {to}")
+        if c.name in names and c.outcome.startswith("accepted")
+        else c
+        for c in candidates
+    ]
 
 
 def each_of(

@@ -91,13 +91,15 @@ def detection_limits(
 ) -> tuple[Limit, ...]:
     """For each effect the smallest size that the data would show, by the quick look's curvature.
 
-    A size of s standard deviations gains s^2 / 2 of log likelihood, less what its prior costs.
+    A size of s standard deviations gains s^2 / 2 of log likelihood, less what the priors of all
+    parameters of the effect cost (by Laplace's approximation, as if they were independent).
     """
     known = {g.effect.name: g for g in glances}
     limits = []
     for effect in catalogue:
         lacks = coverage.missing(effect.needs)
         found = known.get(effect.name)
+        cost = 0.0 if found is None else sum(map(_cost, effect.parameters, found.sd))
         for k, parameter in enumerate(effect.parameters):
             if parameter.low <= parameter.null <= parameter.high and parameter.name == "at":
                 continue
@@ -106,15 +108,20 @@ def detection_limits(
                 note = f"needs {', '.join(lacks)}"
             if found is not None:
                 sd = found.sd[k]
-                width = parameter.high - parameter.low
-                cost = math.log(width / (sd * math.sqrt(2 * math.pi))) if sd > 0 else math.inf
-                size = sd * math.sqrt(2 * (least_gain + max(cost, 0.0)))
-                if size > width:
+                size = sd * math.sqrt(2 * (least_gain + cost)) if sd > 0 else math.inf
+                if size > parameter.high - parameter.low:
                     size, note = math.inf, note or "beyond its prior"
             unit = parameter.shown_unit or parameter.unit
             shown = f"{size * parameter.shown_factor:.2g} {unit}" if math.isfinite(size) else "none"
             limits.append(Limit(effect.name, parameter.name, size, shown, note))
     return tuple(limits)
+
+
+def _cost(parameter: EffectParameter, sd: float) -> float:
+    """The logarithm of how much more the prior holds than the posterior."""
+    if not sd > 0:
+        return math.inf
+    return max(math.log((parameter.high - parameter.low) / (sd * math.sqrt(2 * math.pi))), 0.0)
 
 
 def _shown(estimate: Estimate, parameter: EffectParameter) -> Estimate:

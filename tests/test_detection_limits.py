@@ -1,0 +1,58 @@
+"""Detection limits against integrals of what they approximate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+
+from tpcd.discrepancy.coverage import NEEDED, Coverage
+from tpcd.discrepancy.report_parts import detection_limits
+from tpcd.discrepancy.screening import Glance
+from tpcd.effects import find_effect
+from tpcd.effects.protocol import EffectParameter
+
+LEAST = 6.0
+EXCITED = Coverage(dict.fromkeys(NEEDED, 1e6))
+
+
+def glance_of(name: str, sd: tuple[float, ...]) -> Glance:
+    """A look at an effect whose parameters have these standard deviations."""
+    return Glance(0.0, sd, torch.zeros(1), torch.eye(1), find_effect(name))
+
+
+def log_mean_likelihood(parameter: EffectParameter, size: float, sd: float) -> float:
+    """Of a parameter, over its prior, relative to the null value, where it was measured as size."""
+
+    def likelihood(value: float) -> float:
+        return math.exp(-0.5 * ((value - size) / sd) ** 2)
+
+    near = (max(parameter.low, size - 9 * sd), min(parameter.high, size + 9 * sd))
+    mean = quad(likelihood, *near, epsrel=1e-10)[0] / (parameter.high - parameter.low)
+    return math.log(mean) + 0.5 * ((parameter.null - size) / sd) ** 2
+
+
+@pytest.mark.parametrize(
+    ("name", "sd"), [("floor_tilt", (0.002,)), ("stiffness_error", (0.01, 0.02))]
+)
+def test_an_effect_at_its_limit_gains_what_is_asked_for(name: str, sd: tuple[float, ...]) -> None:
+    """The other parameters are at their null value, and their priors cost all the same."""
+    effect = find_effect(name)
+    limits = detection_limits([glance_of(name, sd)], [effect], EXCITED, LEAST)
+    assert [one.parameter for one in limits] == [p.name for p in effect.parameters]
+    for k, limit in enumerate(limits):
+        sizes = np.where(np.arange(len(sd)) == k, limit.size, 0.0)
+        gains = map(log_mean_likelihood, effect.parameters, sizes.tolist(), sd)
+        assert sum(gains) == pytest.approx(LEAST, abs=1e-3)
+
+
+def test_what_cannot_show_has_no_limit() -> None:
+    effect = find_effect("floor_tilt")
+    (wide,) = detection_limits([glance_of("floor_tilt", (1.0,))], [effect], EXCITED, LEAST)
+    (flat,) = detection_limits([glance_of("floor_tilt", (math.nan,))], [effect], EXCITED, LEAST)
+    (idle,) = detection_limits([], [effect], Coverage({}), LEAST)
+    assert wide.size == flat.size == idle.size == math.inf
+    assert wide.note == flat.note == "beyond its prior" and idle.note.startswith("needs ")

@@ -72,6 +72,15 @@ def test_what_is_missed_is_below_the_limit_where_the_report_says_so() -> None:
     assert missed(("weight", 1.1)) and missed(("weight", None))
     assert missed(("weight", 1.1), verdict="not_enough_information")
     assert not missed(("weight", 0.9)) and not missed(("lever", 1.0)) and not missed()
+    both = key("small", "stiffness_error")  # what two parameters gain adds up
+    sizes = both["hidden"]["stiffness_error"].items()
+    for share, is_below in ((1.3, False), (1.5, True)):
+        limits = [
+            dict(name="stiffness_error", parameter=name, size=share * abs(value))
+            for name, value in sizes
+        ]
+        told = found("nothing_missing", closed=None, limits=limits)
+        assert score_line(both, told).is_below_limit == is_below
     named = found("named", "floor_tilt", limits=[dict(name="payload", parameter="weight", size=2)])
     assert not score_line(truth, named).is_below_limit
     assert not score_line(key("clean"), found("nothing_missing", closed=None)).is_below_limit

@@ -166,16 +166,24 @@ def _sizes(
 
 
 def _is_below_limit(hidden: Mapping[str, Mapping[str, float]], found: Mapping[str, Any]) -> bool:
-    """Whether every parameter that is hidden is smaller than its limit; none is without one."""
+    """Whether every effect that is hidden is too small to show: its parameters together, each in
+    parts of its limit, since their squares add up in what is gained. One without a limit shows."""
     limits = {
         (one["name"], one["parameter"]): math.inf if one["size"] is None else one["size"]
         for one in found.get("detection_limits", ())
     }
+
+    def part(effect: str, name: str, value: float) -> float:
+        size = abs(value - null_value(effect, name)[0])
+        limit = limits.get((effect, name), 0.0)
+        return size / limit if limit > 0 else math.inf
+
     return all(
-        abs(value - null_value(effect, name)[0]) < limits.get((effect, name), 0.0)
+        math.hypot(
+            *(part(effect, *one) for one in values.items() if (effect, one[0]) not in PLACES)
+        )
+        < 1
         for effect, values in hidden.items()
-        for name, value in values.items()
-        if (effect, name) not in PLACES
     )
 
 

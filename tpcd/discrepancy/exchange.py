@@ -10,76 +10,119 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 
 from tpcd.discrepancy.diagnosis import Candidate
-from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit
-from tpcd.discrepancy.settings import AMBIGUOUS
-from tpcd.discrepancy.workbench import Close, Round, Workbench, gave_way
+from tpcd.discrepancy.workbench import (
+    Close,
+    Round,
+    Workbench,
+    fit_well,
+    gave_way,
+    still_close,
+    takes_the_place,
+)
 from tpcd.effects.formula import FORMULA_NAMES
 from tpcd.effects.protocol import Effect
 
-Asked = set[tuple[str, frozenset[str]]]
-"""Models that were taken, or asked about: under which question, with which effects."""
+
+@dataclass
+class Exchanges:
+    """Which models were taken or asked about, so that each is asked about once."""
+
+    models: set[tuple[str, frozenset[str]]] = field(default_factory=set)
+    """The question's fingerprint, and the names of effects."""
+
+    def is_new(self, bench: Workbench, names: Iterable[str]) -> bool:
+        """Whether this model is seen for the first time."""
+        model = bench.question.fingerprint, frozenset(names)
+        was_seen = model in self.models
+        self.models.add(model)
+        return not was_seen
 
 
-def exchanged(bench: Workbench, found: Round, close: Sequence[Close], asked: Asked) -> Round:
+@dataclass(frozen=True)
+class _Exchange:
+    """A model with a new effect in place of an old one."""
+
+    old: Effect
+    fit: Fit
+    price: float
+    """What it has to gain over the model with the old one."""
+
+    @property
+    def worth(self) -> float:
+        """Log evidence beyond the price."""
+        return self.fit.log_evidence - self.price
+
+
+def exchanged(
+    bench: Workbench,
+    found: Round,
+    without: Fit,
+    close: Sequence[Close],
+    done: Exchanges,
+    explained: bool,
+) -> Round:
     """The model with the last effect of what a round tried in place of one of its own, where that
-    explains the data better; `close` is what came close to the model before.
+    explains the data better.
 
-    Each set of effects is asked about once, which `asked` keeps. The round that is returned has the
-    model before as its base, and as `close` what explains the data about as well as what is taken.
+    `found` has the model and what was tried beside it; gains are told over the model `without` its
+    last effect. `close` is what came close to the model, and `explained` says whether it leaves
+    nothing, which what takes its place may not either. The base of the round that is returned is
+    the model, and its `close` what explains the data about as well as what is taken.
     """
-    current, tried = found.base, found.tried
-    asked.add(_model(bench, current.names))
-    vain = tried is None or tried.log_evidence <= current.log_evidence
-    if tried is None or vain or tried.names[-1] in FORMULA_NAMES:  # those are asked in `rivals`
-        return Round(current, None, tuple(close))
-    new, fits = tried.effects[-1], []
+    current, number = found.base, len(found.base.effects) - bench.given
+    done.is_new(bench, current.names)
+    tried = [] if found.tried is None else _tried(bench, current, found.tried, done)
+    if any(one.old is current.effects[-1] for one in tried):
+        # The same effects were asked about in the round in which the last one was added.
+        row = tried[0].fit.names[-1], number
+        bench.candidates[:] = [c for c in bench.candidates if (c.name, c.round) != row]
+    best = max(tried, key=lambda one: one.worth, default=None)
+    taken = None
+    for one in sorted(tried, key=lambda one: one.worth):  # the best comes last
+        gain = one.fit.log_evidence - current.log_evidence
+        stands, reason = False, f"gain {gain:.1f}"
+        if one is best:
+            stands, reason = takes_the_place(bench, one.fit, current, one.price, number, explained)
+            taken = one.fit if stands else None
+        _note(bench, one, one.fit.log_evidence - without.log_evidence, number, stands, reason)
+    models = (current, *(one.fit for one in tried))
+    near = [Close(fit, fit.log_evidence - without.log_evidence) for fit in models if number]
+    return Round(current, taken, still_close(bench, (*close, *near), taken or current))
+
+
+def _tried(bench: Workbench, current: Fit, both: Fit, done: Exchanges) -> list[_Exchange]:
+    """Every exchange that is asked about for the first time, where both together gain something.
+    Formulas take the place of effects in `rivals`."""
+    new = both.effects[-1]
+    if not both.log_evidence > current.log_evidence or new.name in FORMULA_NAMES:
+        return []
+    found = []
     for old in current.effects[bench.given :]:
         effects = (*(effect for effect in current.effects if effect is not old), new)
-        model = _model(bench, (effect.name for effect in effects))
-        if model in asked:
+        if not done.is_new(bench, (effect.name for effect in effects)):
             continue
-        asked.add(model)
         fit = bench.attempt(
             f"{new.name} in place of {old.name} failed",
-            lambda e=effects: fit_model(bench.question, e, (0, 1), start=(tried, current)),
+            lambda effects=effects: fit_well(bench, effects, start=(both, current)),
         )
-        if fit is not None:
-            fits.append((fit.log_evidence - bench.price((new,)) + bench.price((old,)), old, fit))
-    best = max(fits, key=lambda one: one[0], default=(-math.inf, None, current))
-    taken = best[2] if best[0] > current.log_evidence else None
-    number = len(current.effects) - bench.given
-    without = current.log_evidence - _gain(bench, number)
-    for _, old, fit in fits:
-        _note(bench, old, fit, number, fit.log_evidence - without, fit is taken)
-    least = (taken or current).log_evidence - AMBIGUOUS
-    near = [*close, *(Close(fit, fit.log_evidence - without) for _, _, fit in fits)]
-    near += [Close(current, current.log_evidence - without)] if taken else []
-    kept = (one for one in near if one.fit is not taken and one.fit.log_evidence > least)
-    return Round(current, taken, tuple(kept))
-
-
-def _model(bench: Workbench, names: Iterable[str]) -> tuple[str, frozenset[str]]:
-    return bench.question.fingerprint, frozenset(names)
-
-
-def _gain(bench: Workbench, number: int) -> float:
-    """What was accepted in a round gained; the least that this can be, where it is not known."""
-    own = (c for c in bench.candidates if c.round == number and c.outcome.startswith("accepted"))
-    return max((c.gain for c in own), default=bench.settings.least_gain)
+        if fit is not None and math.isfinite(fit.log_evidence):
+            found.append(_Exchange(old, fit, bench.price((new,)) - bench.price((old,))))
+    return found
 
 
 def _note(
-    bench: Workbench, old: Effect, fit: Fit, number: int, gain: float, is_taken: bool
+    bench: Workbench, one: _Exchange, gain: float, number: int, taken: bool, reason: str
 ) -> None:
-    """Put an exchange among the candidates of the last round, in place of what was found there.
-    Where it is taken, what was asked beside the effect that goes will be asked anew."""
-    name = fit.names[-1]
-    outcome = f"{'accepted' if is_taken else 'rejected'} in place of {old.name}: gain {gain:.1f}"
-    bench.tell(f"round {number}: {name} {outcome}")
-    kept = [c for c in bench.candidates if (c.name, c.round) != (name, number)]
-    if is_taken:
-        kept = gave_way((c for c in kept if c.round <= number), (old.name,), name)
-    bench.candidates[:] = [*kept, Candidate(name, number, gain, fit.by_seed, outcome)]
+    """Put an exchange among the candidates of the last round. Where it is taken, what was asked
+    beside the effect that goes will be asked anew, and goes."""
+    new, old = one.fit.names[-1], one.old.name
+    outcome = f"{'accepted' if taken else 'rejected'} in place of {old}: {reason}"
+    bench.tell(f"round {number}: {new} {outcome}")
+    kept = bench.candidates
+    if taken:
+        kept = gave_way((c for c in kept if c.round <= number), (old,), new)
+    bench.candidates[:] = [*kept, Candidate(new, number, gain, one.fit.by_seed, outcome)]

@@ -109,7 +109,7 @@ def detection_limits(
             if found is not None:
                 sd = found.sd[k]
                 size = sd * math.sqrt(2 * (least_gain + cost)) if sd > 0 else math.inf
-                if size > parameter.high - parameter.low:
+                if size > max(parameter.high - parameter.null, parameter.null - parameter.low):
                     size, note = math.inf, note or "beyond its prior"
             unit = parameter.shown_unit or parameter.unit
             shown = f"{size * parameter.shown_factor:.2g} {unit}" if math.isfinite(size) else "none"

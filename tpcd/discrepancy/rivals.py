@@ -32,7 +32,7 @@ from tpcd.discrepancy.workbench import (
     each_of,
     gave_way,
     looked_closer,
-    stands,
+    takes_the_place,
 )
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
@@ -81,13 +81,9 @@ def outdone(bench: Workbench, base: Fit, current: Fit, explained: bool) -> Round
     rival, fit = best
     if fit.log_evidence - rival.price > current.log_evidence - NEARLY_OUTDONE:
         current, (fit,) = looked_closer(bench, current, [fit], RIVAL_SEEDS)
-    taken, reason = stands(bench, fit, current, rival.price, _number(bench, rival))
-    if taken:
-        left = bench.attempt(f"{rival.formula.name} failed", lambda: bench.adequacy(fit))
-        if left is None:
-            taken, reason = False, f"{reason}, what it leaves is not told"
-        elif explained and bench.settings.adequacy and not left.adequate(bench.settings.level):
-            taken, reason = False, f"{reason}, but it leaves something"
+    taken, reason = takes_the_place(
+        bench, fit, current, rival.price, _number(bench, rival), explained
+    )
     for other, its in fits:
         if other is not rival:
             _note(bench, other, its, False, f"gain {its.log_evidence - current.log_evidence:.1f}")

@@ -21,7 +21,7 @@ from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.exchange import Asked, exchanged
+from tpcd.discrepancy.exchange import Exchanges, exchanged
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import better_base, find_confusions, name_one
@@ -30,7 +30,7 @@ from tpcd.discrepancy.report_parts import detection_limits
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import AMBIGUOUS, FEWEST_ROWS, DiagnosisSettings
 from tpcd.discrepancy.variants import FINER, Variant, step_halving, strained
-from tpcd.discrepancy.workbench import Close, Round, Workbench, fit_well
+from tpcd.discrepancy.workbench import Close, Round, Workbench, fit_well, still_close
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
@@ -119,15 +119,15 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     """All rounds: the catalogue; formulas in place of what it found, and beside one that is better
     the catalogue once more; where that does not suffice, formulas beside what was found."""
     settings = bench.settings
-    base = current = fit_well(bench, effects)
-    before = bench.adequacy(base)
+    base = current = before = fit_well(bench, effects)
+    left = bench.adequacy(base)
     find_confusions(bench, base)
-    _tell_adequacy(bench, "the model as it is", before)
+    _tell_adequacy(bench, "the model as it is", left)
     given: tuple[Fit, Question] | None = None
     variants: list[Variant] = []
     close: tuple[Close, ...] = ()
-    asked: set[tuple[str, ...]] = set()
-    asked_instead: Asked = set()
+    outdone_asked: set[tuple[str, ...]] = set()
+    exchanges = Exchanges()
     gone: set[str] = set()  # added, and then not needed: it would be added again
     stages = [settings.catalogue, FORMULAS]
     stage = 0
@@ -150,28 +150,33 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             current = found.base
             if first:
                 base = current
-            if found.best is None:
-                swap = exchanged(bench, found, close, asked_instead)
-                close, current = swap.close, swap.best or current
-                if swap.best is None:
-                    break
-                continue
-            current = pruned(bench, found.best)
-            if found.best.effects[-1] not in current.effects:
+            tried = found.tried
+            if found.best is not None:
+                current = pruned(bench, found.best)
+                if found.best.effects[-1] in current.effects:
+                    kept = _carried_on(bench, close, current) if current is found.best else ()
+                    close, before = (*kept, *found.close), found.base
+                    continue
                 gone.add(found.best.names[-1])
-                base = current if first else base
-                least = current.log_evidence - AMBIGUOUS
-                close = tuple(one for one in close if one.fit.log_evidence > least)
                 pool = [effect for effect in pool if effect.name not in gone]
-                continue
-            kept = _carried_on(bench, close, current) if current is found.best else ()
-            close = (*kept, *found.close)
+                base, tried = (current if first else base), found.best
+            # The model without its last effect, or where that is not known, without any.
+            without = before if len(before.effects) == len(current.effects) - 1 else base
+            held = Round(current, tried=tried)
+            swap = exchanged(bench, held, without, close, exchanges, _explains(bench, current))
+            close = swap.close
+            if swap.best is not None:
+                current = pruned(bench, swap.best, swap.best.effects[bench.given : -1])
+                close = still_close(bench, close, current)
+            elif found.best is None:
+                break
         explained = _explains(bench, current)
         found_some = len(current.effects) > bench.given
-        if found_some and stages[stage] is not FORMULAS and current.names not in asked:
-            asked.add(current.names)
+        if found_some and stages[stage] is not FORMULAS and current.names not in outdone_asked:
+            outdone_asked.add(current.names)
             rival = outdone(bench, base, current, explained)
             close = rival.close if rival.best else (*close, *rival.close)
+            close = still_close(bench, close, rival.best or rival.base)
             current = rival.best or pruned(bench, rival.base, needless(bench, rival.base))
             if not rival.best and current is not rival.base:
                 gone |= set(rival.base.names) - set(current.names)
@@ -193,7 +198,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         )
         bench.tell(bench.notes[-1])
     given = given or (base, bench.question)
-    return Findings(*given, base, current, before, after, close, tuple(variants))
+    return Findings(*given, base, current, left, after, close, tuple(variants))
 
 
 def _against(bench: Workbench, found: Round, base: Fit) -> Round:

@@ -18,6 +18,7 @@ from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.settings import (
     AGREED,
+    AMBIGUOUS,
     CLIMBING,
     CLOSER,
     CLOSER_SEEDS,
@@ -91,7 +92,7 @@ class Close:
 
     fit: Fit
     gain: float
-    """Log evidence minus that of the model without its last effect."""
+    """Log evidence minus that of the model of the round before."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +184,38 @@ def stands(
     if held is None:
         return False, f"{reason}, not told on blocks held out"
     return held > 0, f"{reason}, held-out gain at least {held:+.2f} a transition"
+
+
+def takes_the_place(
+    bench: Workbench, fit: Fit, current: Fit, price: float, number: int, explained: bool
+) -> tuple[bool, str]:
+    """Whether a model takes the place of another one: it `stands` against it, and leaves nothing
+    where that has `explained` the data; and why."""
+    taken, reason = stands(bench, fit, current, price, number)
+    if taken:
+        left = bench.attempt(f"{fit.names[-1]} failed", lambda: bench.adequacy(fit))
+        if left is None:
+            taken, reason = False, f"{reason}, what it leaves is not told"
+        elif explained and bench.settings.adequacy and not left.adequate(bench.settings.level):
+            taken, reason = False, f"{reason}, but it leaves something"
+    return taken, reason
+
+
+def still_close(bench: Workbench, close: Iterable[Close], taken: Fit) -> tuple[Close, ...]:
+    """What explains the data about as well as the model that is taken, beyond what effects have to
+    gain; every other set of effects once, fitted as well as it was."""
+
+    def worth(fit: Fit) -> float:
+        return fit.log_evidence - bench.price(fit.effects[bench.given :])
+
+    best: dict[frozenset[str], Close] = {}
+    for one in close:
+        names = frozenset(one.fit.names)
+        if names not in best or one.fit.log_evidence > best[names].fit.log_evidence:
+            best[names] = one
+    best.pop(frozenset(taken.names), None)
+    least = worth(taken) - AMBIGUOUS
+    return tuple(one for one in best.values() if worth(one.fit) > least)
 
 
 def gave_way(candidates: Iterable[Candidate], names: Sequence[str], to: str) -> list[Candidate]:

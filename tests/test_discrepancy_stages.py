@@ -11,7 +11,7 @@ from diagnosis_bench import CATALOGUE, SETTINGS, bench_of, far_from_the_wall
 
 from tpcd.belief.cloud import start_cloud
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import naming, promises, pruning, search, workbench
+from tpcd.discrepancy import bases, closeness, promises, pruning, search, workbench
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
@@ -100,21 +100,21 @@ def test_another_shape_need_only_be_as_good_as_an_effect(
             return fit(numerics)
         return fit(0.0 if asked.step != question.step else shape)
 
-    monkeypatch.setattr(naming, "fit_model", fitted)
+    monkeypatch.setattr(bases, "fit_model", fitted)
     monkeypatch.setattr(Workbench, "adequacy", lambda *_: Adequacy(0.3, 1e-9, 0.5, ()))
-    monkeypatch.setattr(naming, "fit_well", lambda bench, *_, **__: fitted(bench.question))
-    monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
+    monkeypatch.setattr(bases, "fit_well", lambda bench, *_, **__: fitted(bench.question))
+    monkeypatch.setattr(bases, "fitted_again", lambda bench, fit, *_, **__: fit)
     base, best = fit(0.0), None if rival is None else fit(rival)
-    _, found = naming.better_base(bench, base, best, False)
+    _, found = bases.better_base(bench, base, best, False)
     assert (None if found is None else found[0].name) == chosen
     outcomes = {c.name: c.outcome for c in bench.candidates if c.round == 0}
     assert outcomes == {n: "accepted" if n == chosen else "" for n in outcomes} and outcomes
     # What does not win again, or not over a base model fitted again, is not taken.
-    monkeypatch.setattr(naming, "fit_well", lambda *_, **__: fit(5.9))
-    assert naming.better_base(bench, base, best, False)[1] is None
-    monkeypatch.setattr(naming, "fit_well", lambda bench, *_, **__: fitted(bench.question))
-    monkeypatch.setattr(naming, "fitted_again", lambda *_, **__: fit(50.0))
-    assert naming.better_base(bench, base, best, False)[1] is None
+    monkeypatch.setattr(bases, "fit_well", lambda *_, **__: fit(5.9))
+    assert bases.better_base(bench, base, best, False)[1] is None
+    monkeypatch.setattr(bases, "fit_well", lambda bench, *_, **__: fitted(bench.question))
+    monkeypatch.setattr(bases, "fitted_again", lambda *_, **__: fit(50.0))
+    assert bases.better_base(bench, base, best, False)[1] is None
     assert len(bench.candidates) == len(outcomes)
     assert SETTINGS.least_gain == 6.0
 
@@ -147,7 +147,7 @@ def test_another_shape_is_asked_for_where_the_outline_error_is_strained(
     explains = Adequacy(0.01, 0.5, 0.5, ())
     monkeypatch.setattr(search, "name_one", lambda bench, current, *_: Round(current))
     monkeypatch.setattr(search, "better_base", better)
-    monkeypatch.setattr(search, "strained", lambda fit: strains)
+    monkeypatch.setattr(bases, "strained", lambda fit: strains)
     monkeypatch.setattr(search, "find_confusions", lambda *_: None)
     monkeypatch.setattr(search, "step_halving", lambda *_: 0.0)
     monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: explains)
@@ -171,9 +171,9 @@ def test_what_came_close_is_asked_with_the_next_effect_too(
             raise ValueError("no draw at all")
         return fit(tuple(e.name for e in effects), evidence[effects[0].name])
 
-    monkeypatch.setattr(search, "fit_model", fitted)
+    monkeypatch.setattr(closeness, "fit_model", fitted)
     before = [Close(fit((name,), 50.0), 9.0) for name in (*evidence, "floor_compliance")]
-    kept = search._carried_on(bench, before, fit(("force_bias", "floor_compliance"), 100.0))
+    kept = closeness.carried_on(bench, before, fit(("force_bias", "floor_compliance"), 100.0))
     assert [one.fit.names for one in kept] == [("force_drift", "floor_compliance")]
     assert kept[0].gain == pytest.approx(48.0)
     assert bench.notes == ["wall_tilt failed beside floor_compliance: ValueError: no draw at all"]

@@ -9,7 +9,7 @@ import pytest
 from diagnosis_bench import CATALOGUE, bench_of, far_from_the_wall
 
 from tpcd.data.episode import Episode
-from tpcd.discrepancy import exchange, naming, search
+from tpcd.discrepancy import bases, exchange, naming, search
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.exchange import Exchanges, exchanged
@@ -221,7 +221,7 @@ def test_a_round_keeps_what_it_tried(episode: Episode, monkeypatch: pytest.Monke
         found = naming._judged(bench, base, [tried], 1)
         assert found.tried is tried and (found.best is tried) == is_accepted
         # Beside a better base it may be too little.
-        less = search._against(bench, found, fit_of(bench, (), 108.0))
+        less = bases.held_against(bench, found, fit_of(bench, (), 108.0))
         assert less.tried is tried and less.best is None
 
 
@@ -248,7 +248,7 @@ def test_the_search_goes_on_beside_what_took_the_place(
     monkeypatch.setattr(search, "needless", lambda *_: [])
     monkeypatch.setattr(search, "outdone", lambda bench, base, current, *_: Round(current))
     monkeypatch.setattr(search, "better_base", lambda bench, current, *_: (current, None))
-    monkeypatch.setattr(search, "strained", lambda _: False)
+    monkeypatch.setattr(bases, "strained", lambda _: False)
     monkeypatch.setattr(search, "find_confusions", lambda *_: None)
     monkeypatch.setattr(search, "step_halving", lambda *_: 0.0)
     found = search._search(bench, ())

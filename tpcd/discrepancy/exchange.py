@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from tpcd.discrepancy.closeness import still_close
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.fit import Fit
 from tpcd.discrepancy.workbench import (
@@ -20,7 +21,6 @@ from tpcd.discrepancy.workbench import (
     Workbench,
     fit_well,
     gave_way,
-    still_close,
     takes_the_place,
 )
 from tpcd.effects.formula import FORMULA_NAMES

@@ -18,7 +18,7 @@ from torch import Tensor
 from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import Fit, Question
+from tpcd.discrepancy.fit import Fit
 from tpcd.discrepancy.promises import (
     draws_agree,
     looks_at,
@@ -38,13 +38,11 @@ from tpcd.discrepancy.settings import (
     UNDECIDED,
     WITHIN,
 )
-from tpcd.discrepancy.variants import FINER_STEPS, VARIANTS, WIDE_SHAPE, Variant
 from tpcd.discrepancy.workbench import (
     Close,
     Round,
     Workbench,
     each_of,
-    fit_well,
     fitted_again,
     looked_closer,
     second_best,
@@ -140,57 +138,6 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     if not near:
         return Round(current)
     return _judged(bench, current, near, number)
-
-
-def better_base(
-    bench: Workbench, current: Fit, rival: Fit | None, explained: bool
-) -> tuple[Fit, tuple[Variant, Question, Fit] | None]:
-    """The model as it is, perhaps better fitted, and the variant of it that explains the data best,
-    if it does so better than the model as it is and the `rival`, the best candidate. Another shape
-    need only be as good as the rival: an effect that is there is found beside it, and one that is
-    not would stand for it. Only the shape is asked about after an effect, since what numerics do
-    would have shown before it, and where the model has `explained` the data, which numerics would
-    not. What wins on one seed has to win on two, against a model that starts from where it is."""
-    found: list[tuple[Fit, Variant, Question]] = []
-    enough = rival is not None and bench.adequacy(rival).adequate(bench.settings.level)
-    first = len(current.effects) == bench.given
-    for variant in VARIANTS if first and not explained else (WIDE_SHAPE,):
-        if enough and variant is FINER_STEPS:
-            continue  # slow, and nothing is left for it to explain
-        question = variant.change(bench.question)
-        fit = bench.attempt(
-            f"{variant.name} failed",
-            lambda q=question: fit_model(q, current.effects, (0,), start=(current,)),
-        )
-        if fit is not None:
-            found.append((fit, variant, question))
-    reached = -math.inf if rival is None else rival.log_evidence
-    least = bench.settings.least_gain
-
-    def wins(fit: Fit, variant: Variant) -> bool:
-        more = 0.0 if variant is WIDE_SHAPE else least
-        return fit.log_evidence >= max(current.log_evidence + least, reached + more)
-
-    best = max(found, key=lambda one: one[0].log_evidence, default=None)
-    chosen = None
-    if best is not None and wins(*best[:2]):
-        fit, variant, question = best
-        wide = replace(bench, question=question)
-        current = fitted_again(bench, current, 12, (current, fit))
-        well = bench.attempt(
-            f"{variant.name} failed when fitted again",
-            lambda: fit_well(wide, current.effects, start=(current, fit)),
-        )
-        if well is not None and wins(well, variant):
-            chosen = variant, question, well
-    names = [variant.name for _, variant, _ in found]
-    bench.candidates[:] = [c for c in bench.candidates if c.round or c.name not in names]
-    for fit, variant, _ in found:
-        taken = chosen is not None and variant is chosen[0]
-        shown = chosen[2] if chosen is not None and taken else fit
-        gain, outcome = shown.log_evidence - current.log_evidence, "accepted" if taken else ""
-        bench.candidates.append(Candidate(variant.name, 0, gain, shown.by_seed, outcome))
-    return current, chosen
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

@@ -17,20 +17,21 @@ from tpcd.belief.prior import make_prior
 from tpcd.belief.settings import EstimatorSettings
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
+from tpcd.discrepancy.bases import better_base, held_against, is_doubtful
+from tpcd.discrepancy.closeness import carried_on, still_close
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Diagnosis
-from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.exchange import Exchanges, exchanged
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.memory import Memory
-from tpcd.discrepancy.naming import better_base, find_confusions, name_one
+from tpcd.discrepancy.naming import find_confusions, name_one
 from tpcd.discrepancy.pruning import needless, pruned
 from tpcd.discrepancy.report_parts import detection_limits
 from tpcd.discrepancy.rivals import outdone
-from tpcd.discrepancy.settings import AMBIGUOUS, FEWEST_ROWS, DiagnosisSettings
-from tpcd.discrepancy.variants import FINER, Variant, step_halving, strained
-from tpcd.discrepancy.workbench import Close, Round, Workbench, fit_well, still_close
+from tpcd.discrepancy.settings import FEWEST_ROWS, DiagnosisSettings
+from tpcd.discrepancy.variants import FINER, Variant, step_halving
+from tpcd.discrepancy.workbench import Close, Round, Workbench, fit_well
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
@@ -137,7 +138,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             first = len(current.effects) == bench.given
             found = name_one(bench, current, pool, bench.adequacy(current).adequate(0.05))
             explained = _explains(bench, found.base)
-            if stage == 0 and not variants and _doubtful(found, explained):
+            if stage == 0 and not variants and is_doubtful(found, explained):
                 again, better = better_base(bench, found.base, found.best, explained)
                 if better is not None:
                     given = (base if not first else again, bench.question)
@@ -146,7 +147,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
                     close = ()
                     continue
                 if again is not found.base:
-                    found = _against(bench, found, again)
+                    found = held_against(bench, found, again)
             current = found.base
             if first:
                 base = current
@@ -154,7 +155,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
             if found.best is not None:
                 current = pruned(bench, found.best)
                 if found.best.effects[-1] in current.effects:
-                    kept = _carried_on(bench, close, current) if current is found.best else ()
+                    kept = carried_on(bench, close, current) if current is found.best else ()
                     close, before = (*kept, *found.close), found.base
                     continue
                 gone.add(found.best.names[-1])
@@ -201,29 +202,6 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     return Findings(*given, base, current, left, after, close, tuple(variants))
 
 
-def _against(bench: Workbench, found: Round, base: Fit) -> Round:
-    """A round beside a base model that is fitted better, of which its best may gain too little."""
-    best = found.best
-    if best is None:
-        return replace(found, base=base)
-    gain = best.log_evidence - base.log_evidence
-    if gain >= bench.price(best.effects[-1:]):
-        return replace(found, base=base)
-    place = (best.names[-1], len(base.effects) - bench.given + 1)
-    outcome = f"rejected: gain {gain:.1f} over the model fitted again"
-    bench.candidates[:] = [
-        replace(c, outcome=outcome) if (c.name, c.round) == place else c for c in bench.candidates
-    ]
-    bench.tell(f"round {place[1]}: {place[0]} {outcome}")
-    return Round(base, tried=best)
-
-
-def _doubtful(found: Round, explained: bool) -> bool:
-    """Whether another base model is asked for: where something is left, would be added, or stands
-    for what the shape prior does not know."""
-    return not explained or found.best is not None or strained(found.base)
-
-
 def _taken(
     bench: Workbench,
     current: Fit,
@@ -241,25 +219,6 @@ def _taken(
     base = fit if len(fit.effects) == bench.given else fit_well(bench, effects, start=(fit,))
     _tell_adequacy(bench, f"the model with {variant.name}", bench.adequacy(base))
     return base, fit
-
-
-def _carried_on(bench: Workbench, close: Sequence[Close], best: Fit) -> list[Close]:
-    """What came close to a model before its last effect was added, with that effect too, where it
-    still comes close."""
-    kept, added = [], best.effects[-1]
-    for one in close:
-        own = one.fit.effects
-        if added.name in one.fit.names:
-            continue
-        fit = bench.attempt(
-            f"{' and '.join(one.fit.names)} failed beside {added.name}",
-            lambda own=own, one=one: fit_model(
-                bench.question, (*own, added), (0, 1), start=(one.fit, best)
-            ),
-        )
-        if fit is not None and fit.log_evidence > best.log_evidence - AMBIGUOUS:
-            kept.append(Close(fit, fit.log_evidence - one.fit.log_evidence))
-    return kept
 
 
 def _explains(bench: Workbench, fit: Fit) -> bool:

@@ -18,7 +18,6 @@ from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.settings import (
     AGREED,
-    AMBIGUOUS,
     CLIMBING,
     CLOSER,
     CLOSER_SEEDS,
@@ -199,23 +198,6 @@ def takes_the_place(
         elif explained and bench.settings.adequacy and not left.adequate(bench.settings.level):
             taken, reason = False, f"{reason}, but it leaves something"
     return taken, reason
-
-
-def still_close(bench: Workbench, close: Iterable[Close], taken: Fit) -> tuple[Close, ...]:
-    """What explains the data about as well as the model that is taken, beyond what effects have to
-    gain; every other set of effects once, fitted as well as it was."""
-
-    def worth(fit: Fit) -> float:
-        return fit.log_evidence - bench.price(fit.effects[bench.given :])
-
-    best: dict[frozenset[str], Close] = {}
-    for one in close:
-        names = frozenset(one.fit.names)
-        if names not in best or one.fit.log_evidence > best[names].fit.log_evidence:
-            best[names] = one
-    best.pop(frozenset(taken.names), None)
-    least = worth(taken) - AMBIGUOUS
-    return tuple(one for one in best.values() if worth(one.fit) > least)
 
 
 def gave_way(candidates: Iterable[Candidate], names: Sequence[str], to: str) -> list[Candidate]:

@@ -63,7 +63,7 @@ def ask(
 ) -> Round:
     """Ask about an exchange, beside a model without effects that has 60."""
     without, done = fit_of(bench, (), 60.0), Exchanges() if done is None else done
-    return exchanged(bench, Round(current, tried=tried), without, close, done, explained)
+    return exchanged(bench, current, tried, without, close, done, explained)
 
 
 @pytest.mark.parametrize(

@@ -199,7 +199,7 @@ def test_what_draws_and_fits_agree_about_is_not_looked_at_more_closely(
     monkeypatch.setattr(naming, "fit_model", fit)
     monkeypatch.setattr(naming, "fitted_again", lambda bench, fit, *_, **__: fit)
     monkeypatch.setattr(naming, "looked_closer", look_closer)
-    monkeypatch.setattr(naming, "stands", lambda *_: (False, ""))
+    monkeypatch.setattr(naming, "takes_the_place", lambda *_, **__: (False, ""))
     base = Fit((), bench.question.step, bench.question.scene, (100.0, 100.0), ())
     naming.name_one(bench, base, CATALOGUE[:1], True)
     assert len(asked) == closer

@@ -2,8 +2,8 @@
 
 Effects that look alike differ by little, and a search that misses the mode of one by more names
 the other. Beside that, the right one gains hardly anything, but the model with both has found where
-it leads. From there, it is asked to do without each of the effects before (the exchange step of
-stepwise selection, see Miller 2002, Subset Selection in Regression).
+it leads. From there, it is asked to do without each of the effects before (sequential replacement,
+in the choice of regressors by Miller 1984).
 """
 
 from __future__ import annotations
@@ -59,23 +59,24 @@ class _Exchange:
 
 def exchanged(
     bench: Workbench,
-    found: Round,
+    current: Fit,
+    both: Fit | None,
     without: Fit,
     close: Sequence[Close],
     done: Exchanges,
     explained: bool,
 ) -> Round:
-    """The model with the last effect of what a round tried in place of one of its own, where that
-    explains the data better.
+    """The current model with the last effect of `both`, which a round tried beside it, in place of
+    one of its own, where that explains the data better.
 
-    `found` has the model and what was tried beside it; gains are told over the model `without` its
-    last effect. `close` is what came close to the model, and `explained` says whether it leaves
-    nothing, which what takes its place may not either. The base of the round that is returned is
-    the model, and its `close` what explains the data about as well as what is taken.
+    Gains are told over the model `without` its last effect. `close` is what came close to the
+    current model, and `explained` says whether it leaves nothing, which what takes its place may
+    not either. The base of the round that is returned is the current model, and its `close` what
+    explains the data about as well as what is taken.
     """
-    current, number = found.base, len(found.base.effects) - bench.given
+    number = len(current.effects) - bench.given
     done.is_new(bench, current.names)
-    tried = [] if found.tried is None else _tried(bench, current, found.tried, done)
+    tried = [] if both is None else _tried(bench, current, both, done)
     if any(one.old is current.effects[-1] for one in tried):
         # The same effects were asked about in the round in which the last one was added.
         row = tried[0].fit.names[-1], number

@@ -46,7 +46,7 @@ from tpcd.discrepancy.workbench import (
     fitted_again,
     looked_closer,
     second_best,
-    stands,
+    takes_the_place,
 )
 from tpcd.effects.protocol import Effect
 
@@ -142,10 +142,8 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:
     """Whether the best of the candidates is accepted, and what comes close to it."""
-    best = near[0]
-    accepted, reason = stands(bench, best, current, bench.price(best.effects[-1:]), number)
-    if accepted and bench.attempt(f"{best.names[-1]} failed", lambda: bench.adequacy(best)) is None:
-        accepted, reason = False, f"{reason}, what it leaves is not told"
+    best, price = near[0], bench.price(near[0].effects[-1:])
+    accepted, reason = takes_the_place(bench, best, current, price, number, explained=False)
     outcome = f"{'accepted' if accepted else 'rejected'}: {reason}"
     place = (best.names[-1], number)
     bench.candidates[:] = [

@@ -31,7 +31,7 @@ from tpcd.discrepancy.report_parts import detection_limits
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import FEWEST_ROWS, DiagnosisSettings
 from tpcd.discrepancy.variants import FINER, Variant, step_halving
-from tpcd.discrepancy.workbench import Close, Round, Workbench, fit_well
+from tpcd.discrepancy.workbench import Close, Workbench, fit_well
 from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
@@ -163,8 +163,8 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
                 base, tried = (current if first else base), found.best
             # The model without its last effect, or where that is not known, without any.
             without = before if len(before.effects) == len(current.effects) - 1 else base
-            held = Round(current, tried=tried)
-            swap = exchanged(bench, held, without, close, exchanges, _explains(bench, current))
+            explained = _explains(bench, current)
+            swap = exchanged(bench, current, tried, without, close, exchanges, explained)
             close = swap.close
             if swap.best is not None:
                 current = pruned(bench, swap.best, swap.best.effects[bench.given : -1])
@@ -176,8 +176,8 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         if found_some and stages[stage] is not FORMULAS and current.names not in outdone_asked:
             outdone_asked.add(current.names)
             rival = outdone(bench, base, current, explained)
-            close = rival.close if rival.best else (*close, *rival.close)
-            close = still_close(bench, close, rival.best or rival.base)
+            near = rival.close if rival.best else (*close, *rival.close)
+            close = still_close(bench, near, rival.best or rival.base)
             current = rival.best or pruned(bench, rival.base, needless(bench, rival.base))
             if not rival.best and current is not rival.base:
                 gone |= set(rival.base.names) - set(current.names)

@@ -2,8 +2,8 @@
 
 Effects that look alike differ by little, and a search that misses the mode of one by more names
 the other. Beside that, the right one gains hardly anything, but the model with both has found where
-it leads. From there, it is asked to do without each of the effects before (sequential replacement,
-in the choice of regressors by Miller 1984).
+it leads. From there, it is asked to do without each of the effects before, one by one (the
+sequential replacement of Miller 1984, for the choice of regressors).
 """
 
 from __future__ import annotations

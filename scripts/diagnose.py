@@ -49,7 +49,6 @@ def diagnose_episodes(config: Diagnose) -> int:
     Returns 0 where nothing is missing, 10 to 14 for the other verdicts in the order named,
     ambiguous, formula, unknown remains, not enough information.
     """
-    import math
     import sys
     from dataclasses import replace
     from shlex import quote
@@ -65,6 +64,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         open_diagnosis,
         write_diagnosis,
     )
+    from tpcd.commands.gap_rows import shown_gaps, shown_share
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.formula import FORMULAS
@@ -101,21 +101,13 @@ def diagnose_episodes(config: Diagnose) -> int:
                 data.episodes, shape, settings, data.fresh, model.effects, _tell, memory
             )
         found = replace(found, notes=(*data.notes, *found.notes))
-        rows = [
-            {
-                "channel": f"{gap.channel} [{gap.unit}]",
-                "before": gap.before,
-                "after": gap.after,
-                "noise": gap.noise_floor,
-                "closed": f"{gap.closed:.0%}" if math.isfinite(gap.closed) else "no excess",
-            }
-            for gap in found.gap
-        ]
-        if rows:
-            print(f"\none-step errors on {found.held_out}\n{format_table(rows)}")
+        if found.gap:
+            print(f"\none-step errors on {found.held_out}, with 90 % intervals")
+            print(format_table(shown_gaps(found.gap)))
+            print(f"closed of the excess over the noise, all channels: {shown_share(found)}")
         with SummaryWriter(folder / "tensorboard") as writer:
             write_diagnosis(found, data.episodes, settings.least_gain, config.prior, folder, writer)
-        write_results(folder, rows, seeds=[config.seed])
+        write_results(folder, [vars(gap) for gap in found.gap], seeds=[config.seed])
         forget_fits(folder)
     print(f"\nreport in {config.out}/report.html, verdict in {config.out}/verdict.json", end="")
     if found.effects:

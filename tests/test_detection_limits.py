@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import quad
 
 from tpcd.discrepancy.coverage import NEEDED, Coverage
-from tpcd.discrepancy.report_parts import detection_limits
+from tpcd.discrepancy.report_parts import NOT_ALONE, detection_limits, told_limits
 from tpcd.discrepancy.screening import Glance
 from tpcd.effects import find_effect
 from tpcd.effects.protocol import EffectParameter
@@ -56,3 +56,19 @@ def test_what_cannot_show_has_no_limit() -> None:
     (idle,) = detection_limits([], [effect], Coverage({}), LEAST)
     assert wide.size == flat.size == idle.size == math.inf
     assert wide.note == flat.note == "beyond its prior" and idle.note.startswith("needs ")
+
+
+def test_limits_are_told_in_units_that_people_read() -> None:
+    """A lever without a weight shows in nothing, and is no reason to doubt the weight."""
+    payload, friction = find_effect("payload"), find_effect("wall_friction")
+    glances = [glance_of("payload", (0.01, math.inf)), glance_of("wall_friction", (0.02,))]
+    needed = Coverage({need: 1e6 for need in NEEDED if need != "lift-off"})
+    catalogue = [payload, friction, find_effect("adhesion")]
+    weight, lever, ratio, adhesion = detection_limits(glances, catalogue, needed, LEAST)
+    assert lever.note == NOT_ALONE and lever.size == math.inf and weight.shown.endswith(" N")
+    assert ratio.shown == f"{ratio.size:.2g}"  # no unit
+    assert adhesion.note == "needs lift-off"
+    told = told_limits((weight, lever, ratio, adhesion))
+    expected = f"payload {weight.shown}, wall_friction {ratio.shown}; at no size that is expected:"
+    assert " ".join(told.split()).endswith(f"{expected} adhesion (needs lift-off)")
+    assert max(map(len, told.splitlines())) <= 100 and "lever" not in told

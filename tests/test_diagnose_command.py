@@ -23,6 +23,12 @@ from tpcd.discrepancy.diagnosis import (
 from tpcd.discrepancy.memory import Memory
 
 
+def a_gap(contact: str, rows: int) -> Gap:
+    """Of z, closed."""
+    before, after = (4e-4, 3e-4, 5e-4), (2e-4, 1.8e-4, 2.4e-4)
+    return Gap("z", "m", contact, rows, *before, *after, 2e-4, 1.0, 0.9, 1.0)
+
+
 def a_diagnosis() -> Diagnosis:
     """A soft floor, named."""
     size = Estimate("compliance", 2e-4, 1e-5, 1.8e-4, 2.2e-4, "m/N", "2.00 ± 0.10 mm per 10 N")
@@ -35,8 +41,11 @@ def a_diagnosis() -> Diagnosis:
             Candidate("floor_compliance", 1, 30.0, (1.0, 2.0), "accepted: gain 30.0"),
             Candidate("adhesion", 1, float("nan"), (), "not excited: lift-off"),
         ),
-        gap=(Gap("z", "m", 4e-4, 2e-4, 2e-4, 1.0, 0.9, 1.0),),
+        gap=(a_gap("all", 50),),
+        gap_by_contact=(a_gap("floor and wall", 7),),
         share_closed=0.95,
+        share_closed_low=0.9,
+        share_closed_high=0.99,
         held_out="fresh episodes",
         cells_before=cells,
         cells_after=cells,
@@ -155,6 +164,13 @@ def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:
         assert caption and save_figure(figure, tmp_path, name).stat().st_size > 5000
     with SummaryWriter(tmp_path / "tensorboard") as writer:
         page = write_diagnosis(found, [], 6.0, PRIOR, tmp_path, writer).read_text()
-    for text in ("2.00 ± 0.10 mm per 10 N", "95 % of the excess", "needs lift-off", "30.0"):
+    for text in (
+        *("2.00 ± 0.10 mm per 10 N", "all channels: 95 % (90 to 99)", "needs lift-off", "30.0"),
+        *("floor and wall (7)", "z [mm]", "0.400 (0.300 to 0.500)", "100 % (90 to 100)"),
+    ):
         assert text in page
+    written = json.loads((tmp_path / "verdict.json").read_text())
+    assert set(written["evidence"]) == {"before", "after", "candidates"}
+    assert written["evidence"]["candidates"][0]["name"] == "floor_compliance"
+    assert written["gap_by_contact"][0]["contact"] == "floor and wall"
     assert "http" not in page.replace("http-equiv", "")

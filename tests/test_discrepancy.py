@@ -22,7 +22,8 @@ from tpcd.discrepancy.coverage import MOTIONS, NEEDED, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
-from tpcd.discrepancy.heldout import Errors, folds
+from tpcd.discrepancy.gaps import Errors, Gaps
+from tpcd.discrepancy.heldout import folds
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.report_parts import shown_value
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
@@ -94,6 +95,13 @@ def test_a_soft_floor_is_named_with_its_size_and_the_gap_shrinks(shape: PolygonS
     by_channel = {gap.channel: gap for gap in found.gap}
     assert by_channel["z"].after < by_channel["z"].before
     assert found.share_closed > 0.7
+    assert 0.5 < found.share_closed_low <= found.share_closed <= found.share_closed_high
+    on_floor, free = (
+        next(g for g in found.gap_by_contact if (g.contact, g.channel) == (contact, "z"))
+        for contact in ("floor", "free")
+    )
+    assert on_floor.before > 2 * on_floor.noise_floor > 2 * on_floor.after / 1.5
+    assert free.before < 1.5 * free.noise_floor
     assert found.log_evidence - found.log_evidence_base > SMALL.least_gain
     assert (
         found.belief is not None and found.belief.prior.names[-1] == "floor_compliance.compliance"
@@ -209,7 +217,8 @@ def test_where_something_is_left_effects_must_close_half_of_the_gap(
     asked: list[tuple[Errors, Fit, object]] = []
 
     def errors(question: Question, fit: Fit, given: object) -> Errors:
-        asked.append((Errors(torch.zeros(1, 6).double(), torch.ones(1, 6).double()), fit, given))
+        one = Errors(torch.zeros(1, 6).double(), torch.ones(1, 6).double(), torch.zeros(1).long())
+        asked.append((one, fit, given))
         return asked[-1][0]
 
     for name in ("held_out_errors", "prediction_errors"):
@@ -223,7 +232,9 @@ def test_where_something_is_left_effects_must_close_half_of_the_gap(
         return shares[id(given)]
 
     monkeypatch.setattr("tpcd.discrepancy.conclude.typical_share", closed)
-    monkeypatch.setattr("tpcd.discrepancy.conclude.gaps", lambda *e: ([], closed(*e[:2])))
+    monkeypatch.setattr(
+        "tpcd.discrepancy.conclude.gaps", lambda *e: Gaps((), (), closed(*e[:2]), 0.0, 1.0)
+    )
     monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: left)
     # What is closed on fresh episodes, here the rest, is shown and names nothing.
     found = conclude(bench, Findings(base, question, base, final, left, left), episodes, fresh)

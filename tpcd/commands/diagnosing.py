@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 import tpcd
 from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
+from tpcd.commands.gap_rows import shown_gaps, shown_share
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Candidate, Cell, Diagnosis
 from tpcd.discrepancy.memory import Memory, digest
@@ -163,13 +164,16 @@ def draw_diagnosis(
             "Candidates of the first round, and what later rounds added.",
         )
     if diagnosis.gap:
-        columns = zip(
-            *((g.channel, g.unit, g.before, g.after, g.noise_floor) for g in diagnosis.gap),
-            strict=True,
-        )
+        bars = [
+            (
+                *(g.channel, g.unit, (g.before, g.before_low, g.before_high)),
+                *((g.after, g.after_low, g.after_high), g.noise_floor),
+            )
+            for g in diagnosis.gap
+        ]
         drawn["gap"] = (
-            gap_bars(*(list(column) for column in columns)),
-            f"Errors of one-step predictions on {diagnosis.held_out}.",
+            gap_bars(bars),
+            f"Errors of one-step predictions on {diagnosis.held_out}, with 90 % intervals.",
         )
         drawn["theta"] = (
             theta_shift(
@@ -197,6 +201,8 @@ def render_page(
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(template).render(
         d=diagnosis,
+        share=shown_share(diagnosis),
+        tables=[shown_gaps(diagnosis.gap), shown_gaps(diagnosis.gap_by_contact, by_contact=True)],
         images=images,
         episodes=[str(path) for path in paths if path is not None],
         finite=math.isfinite,

@@ -10,16 +10,11 @@ from tpcd.belief.belief import Belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.deciding import deciding_motion
-from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, Gap, NamedEffect, Verdict
+from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question, joined_fit, posterior
-from tpcd.discrepancy.heldout import (
-    Errors,
-    gaps,
-    held_out_errors,
-    prediction_errors,
-    typical_share,
-)
+from tpcd.discrepancy.gaps import Errors, Gaps, gaps, typical_share
+from tpcd.discrepancy.heldout import held_out_errors, prediction_errors
 from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
 from tpcd.discrepancy.settings import ENOUGH_DRAWS, FEWEST_DRAWS, REPORTED_SEEDS
 from tpcd.discrepancy.variants import NUMERICS, Variant
@@ -65,8 +60,7 @@ def conclude(
 ) -> Diagnosis:
     """The verdict, its effects, and the gap before and after."""
     settings = bench.settings
-    gap: tuple[Gap, ...] = ()
-    share = math.nan
+    gap = Gaps((), (), math.nan, math.nan, math.nan)
     left = settings.adequacy and not found.after.adequate(settings.level)
     held: list[Errors] | None = None
     if found.final is not found.base and left:
@@ -80,8 +74,7 @@ def conclude(
             models = [(found.asked, found.given), (bench.question, found.final)]
             shown = _errors(bench, models, episodes, fresh)
         if shown is not None:
-            channels, share = gaps(*shown, stream(settings.seed, 79))
-            gap = tuple(channels)
+            gap = gaps(*shown, stream(settings.seed, 79))
     belief = first = _reported(bench, bench.question, found.final, REPORTED_SEEDS)
     if found.final is not found.given:
         first = _reported(bench, found.asked, found.given, REPORTED_SEEDS[:1])
@@ -101,8 +94,11 @@ def conclude(
         candidates=tuple(bench.candidates),
         log_evidence_base=found.given.log_evidence,
         log_evidence=found.final.log_evidence,
-        gap=gap,
-        share_closed=share,
+        gap=gap.channels,
+        gap_by_contact=gap.by_contact,
+        share_closed=gap.share,
+        share_closed_low=gap.low,
+        share_closed_high=gap.high,
         held_out="fresh episodes" if fresh else "blocks held out",
         cells_before=found.before.cells,
         cells_after=found.after.cells,
@@ -112,7 +108,10 @@ def conclude(
         theta_after=theta_estimates(belief),
         shape=shape,
         detection_limits=detection_limits(
-            bench.glances, settings.catalogue, bench.coverage, settings.least_gain
+            bench.glances,
+            [effect for effect in settings.catalogue if effect.name not in found.given.names],
+            bench.coverage,
+            settings.least_gain,
         ),
         confusions=tuple(bench.confusions),
         tests=dict(bench.tests),

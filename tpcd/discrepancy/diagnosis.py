@@ -89,15 +89,23 @@ class Gap:
 
     channel: str
     unit: str
+    contact: str
+    """What the rows touch: all, free, floor, wall, or floor and wall."""
+    rows: int
+    """How many they are."""
     before: float
+    before_low: float
+    """90 % interval, as all of these: of blocks of rows drawn with replacement."""
+    before_high: float
     after: float
+    after_low: float
+    after_high: float
     noise_floor: float
     """What sensor noise alone leaves."""
     closed: float
     """Share of the excess over the noise floor that is gone; NaN without an excess."""
-    low: float
-    """90 % interval of that share."""
-    high: float
+    closed_low: float
+    closed_high: float
 
 
 @dataclass(frozen=True)
@@ -134,8 +142,12 @@ class Diagnosis:
     log_evidence_base: float = float("nan")
     log_evidence: float = float("nan")
     gap: tuple[Gap, ...] = ()
+    gap_by_contact: tuple[Gap, ...] = ()
     share_closed: float = float("nan")
     """Of the excess of all channels together, in units of the noise."""
+    share_closed_low: float = float("nan")
+    """90 % interval of that share."""
+    share_closed_high: float = float("nan")
     held_out: str = ""
     """Which data the gap was measured on."""
     cells_before: tuple[Cell, ...] = ()
@@ -167,6 +179,8 @@ class Diagnosis:
     def to_plain(self) -> dict[str, Any]:
         """Plain values for `verdict.json`, without the beliefs."""
         parts = {k: v for k, v in vars(self).items() if not k.startswith("belief")}
+        names = {"before": "log_evidence_base", "after": "log_evidence", "candidates": "candidates"}
+        evidence = {key: parts.pop(name) for key, name in names.items()}
 
         def plain(value: Any) -> Any:
             if isinstance(value, (tuple, list)):
@@ -175,4 +189,5 @@ class Diagnosis:
                 return asdict(value)
             return value
 
-        return {k: plain(v) for k, v in parts.items()}
+        found = {k: plain(v) for k, v in parts.items()}
+        return found | {"evidence": {k: plain(v) for k, v in evidence.items()}}

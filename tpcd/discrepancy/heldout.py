@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,20 +15,13 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.target import ContactTarget
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.diagnosis import CHANNELS, Gap
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question, posterior
+from tpcd.discrepancy.gaps import BLOCK, RESAMPLES, Errors, contact_of
 from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 
 FOLDS = 4
-BLOCK = 5
-"""Transitions that the bootstrap keeps together."""
-RESAMPLES = 2000
-LEAST_EXCESS = 0.1
-"""Share of the noise's variance that counts as a gap."""
-TYPICAL = 0.95
-"""Share of the rows whose largest square before bounds what a number counts in what is typical."""
 FOLD_SAMPLER = SamplerSettings(
     particles=200,
     places=80,
@@ -42,16 +35,6 @@ FOLD_SAMPLER = SamplerSettings(
     fresh_modes=24,
 )
 """Budget of a fit that starts where the fit of all data arrived."""
-UNITS = ("m", "m", "rad", "N", "N", "N·m")
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors of one-step predictions in the mean, and what noise alone would leave."""
-
-    error: Float[Tensor, "n 6"]
-    noise: Float[Tensor, "n 6"]
-    """Standard deviation of the error of a perfect model."""
 
 
 def folds(history: History, count: int = FOLDS) -> list[Bool[Tensor, " n"]]:
@@ -106,7 +89,7 @@ def prediction_errors(question: Question, fit: Fit, episodes: Sequence[Episode])
         misfit_mean=torch.zeros(1, 0, dtype=torch.float64),
         misfit_covariance=torch.zeros(1, 0, 0, dtype=torch.float64),
     )
-    errors, noises = [], []
+    errors, noises, contacts = [], [], []
     for episode in episodes:
         arguments = (episode.poses[:-1], episode.commands[1:], episode.commands[:-1])
         stds = (episode.sensor_std[:3], episode.sensor_std)
@@ -114,80 +97,18 @@ def prediction_errors(question: Question, fit: Fit, episodes: Sequence[Episode])
         error = read - predictor.predict(*arguments, *stds).mean
         errors.append(torch.cat((error[:, :2], wrap_angle(error[:, 2:3]), error[:, 3:]), dim=-1))
         noises.append(ContactPredictor(alone).predict(*arguments, *stds).std)
-    return Errors(torch.cat(errors), torch.cat(noises))
+        contacts.append(contact_of(episode))
+    return Errors(*(torch.cat(part) for part in (errors, noises, contacts)))
 
 
 def held_out_errors(question: Question, fit: Fit, episodes: Sequence[Episode]) -> Errors:
     """Prediction errors of every transition, by a model fitted without its block."""
-    errors, noises = [], []
+    found: list[tuple[Tensor, ...]] = []
     for mask, part, trained in _fold_fits(question, fit):
-        found = prediction_errors(part, trained, episodes)
+        errors = prediction_errors(part, trained, episodes)
         rows = mask[~question.history.seams]
-        errors.append(found.error[rows])
-        noises.append(found.noise[rows])
-    return Errors(*(torch.cat(part) for part in (errors, noises)))
-
-
-def gaps(before: Errors, after: Errors, generator: torch.Generator) -> tuple[list[Gap], float]:
-    """The gap of each channel before and after, and the share closed of all of it."""
-    *squares, floor = _squares(before, after)
-    n = len(floor)
-    draws = _block_draws(n, generator)
-
-    def closed(rows: Tensor) -> Tensor:
-        was, now, least = (part[rows].mean(-2) for part in (*squares, floor))
-        excess = was - least
-        share = (was - torch.maximum(now, least)) / excess
-        # Below this, chance alone makes an excess.
-        chance = max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / n))
-        return torch.where(excess > chance * least, share, torch.nan)
-
-    whole, resampled = closed(torch.arange(n)), closed(draws)
-    found = []
-    for c, channel in enumerate(CHANNELS):
-        known = resampled[:, c][~resampled[:, c].isnan()]
-        ends = torch.quantile(known, torch.tensor([0.05, 0.95]).double()) if len(known) else None
-        found.append(
-            Gap(
-                channel,
-                UNITS[c],
-                *(float(part[:, c].mean().sqrt()) for part in (*squares, floor)),
-                float(whole[c]),
-                *((math.nan, math.nan) if ends is None else ends.tolist()),
-            )
-        )
-    return found, _together(*(part / floor for part in squares))
-
-
-def typical_share(before: Errors, after: Errors) -> float:
-    """Share closed of all of the gap (nan where there is none), where no number counts for more
-    than in nearly all rows before: a few rows that land in another contact decide nothing."""
-    *squares, floor = _squares(before, after)
-    was, now = (part / floor for part in squares)
-    most = torch.quantile(was.amax(-1), TYPICAL)
-    return _together(was.clamp_max(most), now.clamp_max(most))
-
-
-def _squares(before: Errors, after: Errors) -> list[Float[Tensor, "n 6"]]:
-    """Squared errors before and after, and noise, of the rows in which all of them are known."""
-    parts = (before.error, after.error, after.noise)
-    known = torch.stack([torch.isfinite(part).all(-1) for part in parts]).all(0)
-    return [torch.square(part[known]) for part in parts]
-
-
-def _together(before: Float[Tensor, "n 6"], after: Float[Tensor, "n 6"]) -> float:
-    """Share closed of the gap of all channels, from squares in units of the noise."""
-    was, now = before.mean() - 1, after.mean() - 1
-    chance = max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / before.numel()))
-    return float((was - now.clamp_min(0.0)) / was) if was > chance else math.nan
-
-
-def _block_draws(n: int, generator: torch.Generator) -> Tensor:
-    """Rows (RESAMPLES, about n) of blocks drawn with replacement."""
-    starts = torch.arange(0, n, BLOCK)
-    chosen = starts[torch.randint(len(starts), (RESAMPLES, len(starts)), generator=generator)]
-    rows = chosen[..., None] + torch.arange(min(BLOCK, n))
-    return rows.flatten(1).clamp_max(n - 1)
+        found.append(tuple(one[rows] for one in (errors.error, errors.noise, errors.contact)))
+    return Errors(*map(torch.cat, zip(*found, strict=True)))
 
 
 def _predictive(question: Question, fit: Fit) -> Float[Tensor, " n"]:

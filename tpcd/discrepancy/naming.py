@@ -26,6 +26,7 @@ from tpcd.discrepancy.promises import (
     quick_fits,
     seen_itself,
 )
+from tpcd.discrepancy.report_parts import detection_limits, told_limits
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     ASTRAY,
@@ -75,6 +76,9 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     glances = looks_at(bench, current, pool, number, fresh)
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
+        asked = [effect for effect in pool if effect.name not in current.names]
+        limits = detection_limits(glances, asked, bench.coverage, settings.least_gain)
+        bench.tell(told_limits(limits))
     gains = promised_gains(bench, current, glances, number, reached)
     quick: dict[str, Fit] = {}
     lost = settings.from_prior and max(gains.values(), default=0.0) <= PROMISING[False]

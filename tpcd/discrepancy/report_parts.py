@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -16,6 +18,10 @@ from tpcd.effects.protocol import Effect, EffectParameter
 
 SIZES = ("object_width", "object_height")
 """Names of the outline's extents."""
+BEYOND, NOT_ALONE = "beyond its prior", "not without the other parameters"
+"""Why a parameter has no limit."""
+_HARD_SPACE = "\0"
+"""Where lines are not broken."""
 
 
 def named_effects(belief: Belief, given: int) -> tuple[NamedEffect, ...]:
@@ -75,12 +81,10 @@ def estimates(belief: Belief) -> tuple[Estimate, ...]:
 
 def shown_value(value: float, sd: float, parameter: EffectParameter) -> str:
     """A value and its sd as text in the unit in which people read it."""
-    unit = parameter.shown_unit or parameter.unit
     value, sd = value * parameter.shown_factor, sd * parameter.shown_factor
     digits = 2 if sd <= 0 or not math.isfinite(sd) else max(0, 1 - math.floor(math.log10(sd)))
     digits = min(digits, 6)
-    text = f"{value:.{digits}f} ± {sd:.{digits}f}"
-    return text if unit == "1" else f"{text} {unit}"
+    return _with_unit(f"{value:.{digits}f} ± {sd:.{digits}f}", parameter)
 
 
 def detection_limits(
@@ -95,11 +99,12 @@ def detection_limits(
     parameters of the effect cost (by Laplace's approximation, as if they were independent).
     """
     known = {g.effect.name: g for g in glances}
-    limits = []
+    limits: list[Limit] = []
     for effect in catalogue:
         lacks = coverage.missing(effect.needs)
         found = known.get(effect.name)
         cost = 0.0 if found is None else sum(map(_cost, effect.parameters, found.sd))
+        own = []
         for k, parameter in enumerate(effect.parameters):
             if parameter.low <= parameter.null <= parameter.high and parameter.name == "at":
                 continue
@@ -110,18 +115,50 @@ def detection_limits(
                 sd = found.sd[k]
                 size = sd * math.sqrt(2 * (least_gain + cost)) if sd > 0 else math.inf
                 if size > max(parameter.high - parameter.null, parameter.null - parameter.low):
-                    size, note = math.inf, note or "beyond its prior"
-            unit = parameter.shown_unit or parameter.unit
-            shown = f"{size * parameter.shown_factor:.2g} {unit}" if math.isfinite(size) else "none"
-            limits.append(Limit(effect.name, parameter.name, size, shown, note))
+                    size, note = math.inf, note or BEYOND
+            shown = _with_unit(f"{size * parameter.shown_factor:.2g}", parameter)
+            shown = shown if math.isfinite(size) else "none"
+            own.append(Limit(effect.name, parameter.name, size, shown, note))
+        some = any(math.isfinite(limit.size) for limit in own)
+        limits += [
+            replace(limit, note=NOT_ALONE) if some and limit.note == BEYOND else limit
+            for limit in own
+        ]
     return tuple(limits)
+
+
+def told_limits(limits: Sequence[Limit]) -> str:
+    """The limits in lines for people: what would show from which size on, and what would not."""
+    sizes: dict[str, list[str]] = {}
+    none: dict[str, str] = {}
+    for limit in limits:
+        if math.isfinite(limit.size):
+            sizes.setdefault(limit.name, []).append(limit.shown)
+        elif limit.note != NOT_ALONE:
+            none[limit.name] = f"{limit.name} ({limit.note})" if limit.note else limit.name
+    shown = [f"{name} {' and '.join(found)}" for name, found in sizes.items()]
+    text = "preflight: "
+    text += f"an effect shows in these data from about: {_unbroken(shown)}; " if sizes else ""
+    text += f"at no size that is expected: {_unbroken(none.values())}" if none else ""
+    lines = textwrap.fill(text.removesuffix("; "), 100, subsequent_indent="    ")
+    return lines.replace(_HARD_SPACE, " ")
+
+
+def _unbroken(entries: Iterable[str]) -> str:
+    return ", ".join(entry.replace(" ", _HARD_SPACE) for entry in entries)
+
+
+def _with_unit(text: str, parameter: EffectParameter) -> str:
+    unit = parameter.shown_unit or parameter.unit
+    return text if unit == "1" else f"{text} {unit}"
 
 
 def _cost(parameter: EffectParameter, sd: float) -> float:
     """The logarithm of how much more the prior holds than the posterior."""
     if not sd > 0:
         return math.inf
-    return max(math.log((parameter.high - parameter.low) / (sd * math.sqrt(2 * math.pi))), 0.0)
+    share = (parameter.high - parameter.low) / (sd * math.sqrt(2 * math.pi))
+    return math.log(share) if share > 1 else 0.0
 
 
 def _shown(estimate: Estimate, parameter: EffectParameter) -> Estimate:

@@ -19,6 +19,8 @@ _LIMIT = 6.0
 
 CellRow = tuple[str, str, float]
 """Contact mode, channel and score of a cell."""
+Interval = tuple[float, float, float]
+"""A value and the ends of its interval."""
 
 
 def residual_map(
@@ -79,28 +81,28 @@ def evidence_bars(
     return figure
 
 
-def gap_bars(
-    channels: Sequence[str],
-    units: Sequence[str],
-    before: Sequence[float],
-    after: Sequence[float],
-    noise: Sequence[float],
-) -> Figure:
-    """Root mean square error of each channel before and after, and what noise alone leaves."""
-    figure, axes = panels(1, len(channels), 1.5, 2.6)
-    for k, panel in enumerate(axes):
-        factor, unit = display_unit(units[k])
-        panel.bar([0, 1], [factor * before[k], factor * after[k]], color=[BEFORE, AFTER])
-        panel.axhline(factor * noise[k], color=TRUTH, linestyle="--", linewidth=1.0)
+def gap_bars(bars: Sequence[tuple[str, str, Interval, Interval, float]]) -> Figure:
+    """Root mean square errors before and after, and what noise alone leaves.
+
+    Each bar has the channel, its SI unit, the errors before and after, and the noise.
+    """
+    figure, axes = panels(1, len(bars), 1.5, 2.6)
+    for panel, (channel, si_unit, before, after, noise) in zip(axes, bars, strict=True):
+        factor, unit = display_unit(si_unit)
+        value, low, high = factor * np.array([before, after]).T
+        ends = np.maximum([value - low, high - value], 0.0)
+        panel.bar([0, 1], value, color=[BEFORE, AFTER], yerr=ends, ecolor="0.3", capsize=3)
+        panel.axhline(factor * noise, color=TRUTH, linestyle="--", linewidth=1.0)
         panel.set_xticks([])
-        panel.set_ylim(0, 1.15 * factor * max(before[k], after[k], noise[k]))
-        title(panel, f"{channels[k]} [{unit}]")
+        panel.set_ylim(0, 1.15 * max(*high, factor * noise))
+        title(panel, f"{channel} [{unit}]")
     entries = {
         "before": Line2D([], [], color=BEFORE, linewidth=6),
         "after": Line2D([], [], color=AFTER, linewidth=6),
+        "90 % interval": Line2D([], [], color="0.3"),
         "sensor noise alone": Line2D([], [], color=TRUTH, linestyle="--", linewidth=1.0),
     }
-    legend_below(figure, entries, columns=3)
+    legend_below(figure, entries, columns=4)
     return figure
 
 

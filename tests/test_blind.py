@@ -140,7 +140,36 @@ def test_a_stopped_run_goes_on_and_more_suites_may_follow(tmp_path: Path, workfl
         run_blind(replace(config, resume=True, seed=1))
 
 
-@pytest.mark.parametrize("wrong", [{"suites": ("large",)}, {"suites": ()}, {"runs": 0}])
+def test_folders_are_scored_together_and_no_case_counts_twice(
+    tmp_path: Path, workflow: Calls, capsys: pytest.CaptureFixture
+) -> None:
+    first = quick(tmp_path)
+    run_blind(first)
+    second = Blind(out=tmp_path / "more", suites=("clean",), runs=1, seed=SEED)
+    run_blind(second)
+    folders = (first.out, second.out, first.out)
+    both = Blind(out=tmp_path / "both", combine=folders, seed=3, prior="unused")
+    run_blind(both)
+    assert len(workflow.asked) == 4  # nothing is diagnosed again
+    found = results(both)
+    assert [row["runs"] for row in found["suites"]] == [1, 1, 2]
+    assert found["seeds"] == [SEED] and len(found["cases"]) == 4
+    assert [run["suites"] for run in found["runs"]] == [["clean", "medium"], ["clean"]] + [
+        ["clean", "medium"]
+    ]
+    assert {run["prior"] for run in found["runs"]} == {"ycb-rich"}
+    assert all("git" in json.dumps(run["versions"]) for run in found["runs"])
+    for name in ("detection", "sizes", "confusion-quick", "confusion-clean"):
+        assert (both.out / "figures" / f"{name}.png").stat().st_size > 3000
+    with pytest.raises(RunError, match="holds no run"):
+        run_blind(Blind(out=tmp_path / "none", combine=(tmp_path,)))
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"suites": ("large",)}, {"suites": ()}, {"runs": 0}, {"combine": (Path(),), "resume": True}],
+)
 def test_bad_settings_are_refused(wrong: dict) -> None:
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(ValueError, match="expected|not both"):
         Blind(**wrong)

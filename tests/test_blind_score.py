@@ -6,9 +6,10 @@ import math
 
 import pytest
 
+from eval.blind.detection import detection_figure, detection_table, size_calibration
 from eval.blind.marks import mark_table
 from eval.blind.pages import confusion_csv, effect_table, suite_table
-from eval.blind.score import median_interval, score_line, share_interval
+from eval.blind.score import Score, median_interval, score_line, share_interval
 from eval.blind.suites import MEDIUM, OUTSIDE
 
 
@@ -136,7 +137,7 @@ def test_marks_are_reached_missed_or_not_run() -> None:
         "outside: accepted under a catalogue name": ("missed", "50.0%", 2),
         "outside: formula closes 70 %": ("missed", "50.0%", 2),
         "gap closed, medium, median": ("reached", "90.0%", 2),
-        "time of one diagnosis of 60 steps, median": ("reached", "100 s", 12),
+        "time of one diagnosis of 60 steps, median": ("reached", "100 s", 2),
         "one small effect: exact": ("not run", None, 0),
     }
     for item, (outcome, value, runs) in expected.items():
@@ -148,3 +149,47 @@ def test_marks_are_reached_missed_or_not_run() -> None:
     assert effect_table(scores)[0]["otherwise"] == "payload (1)"
     clean = [one for one in scores if one.suite == "clean"]
     assert confusion_csv(clean) == "truth,nothing_missing,payload\nclean,9,1\n"
+
+
+def test_detection_goes_by_size_and_by_the_limit_that_is_stated() -> None:
+    """A payload of 1 N is medium; one of 0.35 N is small, and above the limit of 0.1 N."""
+
+    def one(suite: str, weight: float, limit: float | None, *names: str) -> Score:
+        truth = key(suite, "payload")
+        truth["hidden"]["payload"]["weight"] = weight
+        told = [dict(name="payload", parameter="weight", size=limit)]
+        return score_line(
+            truth, found("named" if names else "nothing_missing", *names, limits=told)
+        )
+
+    scores = [
+        *(one("medium", 1.0, 0.5, "payload"), one("small", 0.3, 0.4), one("small", 0.3, None)),
+        *(one("small", 0.35, 0.1, "payload"), one("small", 0.38, 0.1, "force_bias")),
+        one("no_parity", 1.0, 0.5),  # a part is switched off
+        score_line(key("clean"), found("nothing_missing", closed=None)),
+        score_line(key("pairs", "payload", "floor_tilt"), found("named", "payload")),
+        score_line(key("outside", "friction_field"), found("formula", "friction by x")),
+    ]
+    assert [s.size for s in scores[:5]] == pytest.approx([1.0, 0.3, 0.3, 0.35, 0.38])
+    assert [s.over_limit for s in scores[:4]] == pytest.approx([2.0, 0.75, 0.0, 3.5])
+    assert all(math.isnan(s.size) for s in scores[6:])
+    rows = [
+        tuple(row[k] for k in ("from", "to", "runs", "exact")) for row in detection_table(scores)
+    ]
+    by_size = [(0.25, 0.35, 2, 0.0), (0.35, 0.5, 2, 0.5), (0.9, 1.1, 1, 1.0)]
+    by_limit = [(0.0, 0.5, 1, 0.0), (0.5, 1.0, 1, 0.0), (2.0, 4.0, 3, 2 / 3)]
+    assert rows == by_size + by_limit
+    assert detection_table(scores[6:]) == [] and detection_figure(scores[6:]) is None
+    assert size_calibration(scores[6:]) is None
+
+
+def test_two_parameters_count_together() -> None:
+    truth = key("medium", "stiffness_error")
+    for name in truth["hidden"]["stiffness_error"]:
+        truth["hidden"]["stiffness_error"][name] *= -0.5
+    one = score_line(truth, found("named", "stiffness_error"))
+    assert one.size == pytest.approx(0.5) and math.isnan(one.over_limit)  # no limit is stated
+    parameters = [interval("log_ratio_x", -0.05, 0.01), interval("log_ratio_z", 0.05, 0.01)]
+    named = found("named", "stiffness_error", stiffness_error=parameters)
+    expected = [-math.log(1.1) / 2 + 0.05, -math.log(0.92) / 2 - 0.05]
+    assert score_line(truth, named).size_scores == pytest.approx([100 * e for e in expected])

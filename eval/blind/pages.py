@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from eval.blind.detection import detection_figure, detection_table, size_calibration
 from eval.blind.marks import is_falsely_named, mark_table
 from eval.blind.score import Score, confusion, median_interval, rate, share_interval
 from eval.blind.suites import CLEAN, SUITES
@@ -29,13 +30,14 @@ LETTER = 0.085
 
 
 def report(scores: Sequence[Score], folder: Path, writer: Any) -> dict[str, list[Row]]:
-    """Print all tables, log them, draw the confusion matrices; the tables by name."""
+    """Print all tables, log them, draw the figures; the tables by name."""
     tables = {
         "suites": suite_table(scores),
         "effects": effect_table(scores),
+        "detection": detection_table(scores),
         "marks": mark_table(scores),
     }
-    texts = {name: format_table(rows) for name, rows in tables.items()}
+    texts = {name: format_table(rows) for name, rows in tables.items() if rows}
     print("\n\n".join(texts.values()))
     for name, text in texts.items():
         writer.add_text(name, f"```\n{text}\n```")
@@ -48,6 +50,10 @@ def report(scores: Sequence[Score], folder: Path, writer: Any) -> dict[str, list
         write_text(folder / f"confusion-{suite}.csv", confusion_csv(chosen))
         figure = confusion_figure(chosen, f"{suite}: {len(chosen)} runs")
         save_figure(figure, folder / "figures", f"confusion-{suite}", writer)
+    for name, drawn in (("detection", detection_figure), ("sizes", size_calibration)):
+        figure = drawn(scores)
+        if figure is not None:
+            save_figure(figure, folder / "figures", name, writer)
     return tables
 
 

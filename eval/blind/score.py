@@ -19,7 +19,7 @@ from scipy.stats import binom, binomtest
 
 from eval.blind.cases import null_value
 from eval.blind.sealing import Seal, open_key
-from eval.blind.suites import PLACES
+from eval.blind.suites import MEDIUM, PLACES
 
 NUMERICS = "numerics"
 """The one name that stands for no physics."""
@@ -52,6 +52,10 @@ class Score:
     is_below_limit: bool
     """Nothing is named, and the limits that are reported say that so small an effect could not be
     seen in these data (below the detection limit)."""
+    size: float
+    """Size of the one effect hidden, relative to the medium one; NaN for none, two, or others."""
+    over_limit: float
+    """The same relative to the detection limit that is reported; NaN where none is."""
     closed: float
     """Share of the excess over the noise floor that is gone on fresh data: 0 where an effect is
     hidden and none was named, NaN where there is no excess."""
@@ -59,6 +63,8 @@ class Score:
     """Relative errors of the sizes of the effects, where exact."""
     size_inside: tuple[bool, ...]
     """Whether each 90 % interval of a parameter of an effect holds the truth, where exact."""
+    size_scores: tuple[float, ...]
+    """True values minus estimates of these parameters in posterior deviations."""
     theta_scores: dict[str, float]
     """Distances of theta's entries from the truth in posterior deviations, where exact."""
     seconds: float
@@ -91,7 +97,8 @@ def score_line(key: Mapping[str, Any], line: Mapping[str, Any]) -> Score:
     is_exact = stands and set(names) == set(truth)
     offered = [set(_physical(one["names"])) for one in found["alternatives"]]
     is_within = is_exact or (stands and set(truth) in offered)
-    errors, inside = _sizes(key["hidden"], found["effects"]) if is_exact else ([], [])
+    sizes = _sizes(key["hidden"], found["effects"]) if is_exact else ([], [], [])
+    over = _over_limits(key["hidden"], found)
     return Score(
         suite=key["suite"],
         label=key["label"],
@@ -102,10 +109,13 @@ def score_line(key: Mapping[str, Any], line: Mapping[str, Any]) -> Score:
         is_exact=is_exact,
         is_within=is_within,
         is_wrong=not is_within and not set(names) <= set(truth),
-        is_below_limit=bool(truth) and not names and _is_below_limit(key["hidden"], found),
+        is_below_limit=bool(truth) and not names and max(over) < 1,
+        size=_relative_size(key["hidden"]),
+        over_limit=over[0] if len(over) == 1 and math.isfinite(over[0]) else math.nan,
         closed=0.0 if truth and not names else _number(found["share_closed"]),
-        size_errors=tuple(errors),
-        size_inside=tuple(inside),
+        size_errors=tuple(sizes[0]),
+        size_inside=tuple(sizes[1]),
+        size_scores=tuple(sizes[2]),
         theta_scores=_theta(key["theta"], found["theta_after"]) if is_exact else {},
         seconds=line["wall_s"] if "diagnosis" in line else math.nan,
     )
@@ -150,8 +160,9 @@ def _physical(names: Iterable[str]) -> tuple[str, ...]:
 
 def _sizes(
     hidden: Mapping[str, Mapping[str, float]], effects: Iterable[Mapping[str, Any]]
-) -> tuple[list[float], list[bool]]:
-    errors, inside = [], []
+) -> tuple[list[float], list[bool], list[float]]:
+    """Relative errors, whether the intervals hold the truth, and deviations from it."""
+    errors, inside, scores = [], [], []
     for effect in effects:
         if effect["name"] not in hidden:  # numerics
             continue
@@ -160,14 +171,31 @@ def _sizes(
             null = null_value(*place)[0]
             true = hidden[effect["name"]].get(found["name"], null)
             inside.append(_number(found["low"]) <= true <= _number(found["high"]))
+            scores.append((true - _number(found["value"])) / max(_number(found["sd"]), 1e-12))
             if true != null and place not in PLACES:
                 errors.append(abs(_number(found["value"]) - true) / abs(true - null))
-    return errors, inside
+    return errors, inside, scores
 
 
-def _is_below_limit(hidden: Mapping[str, Mapping[str, float]], found: Mapping[str, Any]) -> bool:
-    """Whether every effect that is hidden is too small to show: its parameters together, each in
-    parts of its limit, since their squares add up in what is gained. One without a limit shows."""
+def _relative_size(hidden: Mapping[str, Mapping[str, float]]) -> float:
+    """Size of the only effect relative to the medium one, the root mean square over parameters."""
+    if len(hidden) != 1 or not set(hidden) <= set(MEDIUM):
+        return math.nan
+    ((effect, values),) = hidden.items()
+    ratios = [
+        (value - null_value(effect, name)[0]) / (MEDIUM[effect][name] - null_value(effect, name)[0])
+        for name, value in values.items()
+        if (effect, name) not in PLACES
+    ]
+    return math.hypot(*ratios) / math.sqrt(len(ratios))
+
+
+def _over_limits(
+    hidden: Mapping[str, Mapping[str, float]], found: Mapping[str, Any]
+) -> list[float]:
+    """How many times the limits that are reported each effect hidden is: its parameters together,
+    each in parts of its limit, since their squares add up in what is gained. Infinite for one
+    without a limit."""
     limits = {
         (one["name"], one["parameter"]): math.inf if one["size"] is None else one["size"]
         for one in found.get("detection_limits", ())
@@ -178,13 +206,12 @@ def _is_below_limit(hidden: Mapping[str, Mapping[str, float]], found: Mapping[st
         limit = limits.get((effect, name), 0.0)
         return size / limit if limit > 0 else math.inf
 
-    return all(
+    return [
         math.hypot(
             *(part(effect, *one) for one in values.items() if (effect, one[0]) not in PLACES)
         )
-        < 1
         for effect, values in hidden.items()
-    )
+    ]
 
 
 def _theta(true: Mapping[str, float], estimates: Iterable[Mapping[str, Any]]) -> dict[str, float]:

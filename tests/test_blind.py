@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from eval.blind.__main__ import Blind, case_seed, cases_of, run_blind, score
+from eval.blind.combine import Combine, combine
 from eval.blind.sealing import key_path
 from eval.blind.suites import Case
 from eval.blind.trial import read_verdicts
@@ -51,7 +52,8 @@ def workflow(monkeypatch: pytest.MonkeyPatch) -> Calls:
 
     module = SimpleNamespace(DiagnosisSettings=FakeSettings, diagnose=diagnose)
     monkeypatch.setitem(sys.modules, "tpcd.discrepancy.search", module)
-    monkeypatch.setattr("eval.blind.trial.load_shape", lambda prior: None)
+    for place in ("trial", "pages"):
+        monkeypatch.setattr(f"eval.blind.{place}.load_shape", lambda prior: None)
     return calls
 
 
@@ -59,7 +61,7 @@ def quick(tmp_path: Path) -> Blind:
     return Blind(out=tmp_path / "blind", quick=True)
 
 
-def results(config: Blind) -> dict:
+def results(config: Blind | Combine) -> dict:
     return json.loads((config.out / "results.json").read_text())
 
 
@@ -144,32 +146,52 @@ def test_folders_are_scored_together_and_no_case_counts_twice(
     tmp_path: Path, workflow: Calls, capsys: pytest.CaptureFixture
 ) -> None:
     first = quick(tmp_path)
+    workflow.fails.append(2)
     run_blind(first)
     second = Blind(out=tmp_path / "more", suites=("clean",), runs=1, seed=SEED)
     run_blind(second)
-    folders = (first.out, second.out, first.out)
-    both = Blind(out=tmp_path / "both", combine=folders, seed=3, prior="unused")
-    run_blind(both)
-    assert len(workflow.asked) == 4  # nothing is diagnosed again
+    again = replace(first, out=tmp_path / "again")  # the case that failed has a verdict here
+    run_blind(again)
+    both = Combine((first.out, second.out, again.out, first.out), tmp_path / "both")
+    capsys.readouterr()
+    combine(both)
+    assert "3 cases are in several folders" in capsys.readouterr().err
+    assert len(workflow.asked) == 7  # nothing is diagnosed again
     found = results(both)
     assert [row["runs"] for row in found["suites"]] == [1, 1, 2]
-    assert found["seeds"] == [SEED] and len(found["cases"]) == 4
-    assert [run["suites"] for run in found["runs"]] == [["clean", "medium"], ["clean"]] + [
-        ["clean", "medium"]
-    ]
-    assert {run["prior"] for run in found["runs"]} == {"ycb-rich"}
+    assert found["seeds"] == [SEED] and len(found["cases"]) == 4 and found["failed"] == []
+    assert all(row["failed"] == 0.0 for row in found["suites"])
+    assert [Path(run["folder"]).name for run in found["runs"]] == ["blind", "more", "again"]
     assert all("git" in json.dumps(run["versions"]) for run in found["runs"])
     for name in ("detection", "sizes", "confusion-quick", "confusion-clean"):
         assert (both.out / "figures" / f"{name}.png").stat().st_size > 3000
-    with pytest.raises(RunError, match="holds no run"):
-        run_blind(Blind(out=tmp_path / "none", combine=(tmp_path,)))
-    assert not (tmp_path / "none").exists()
+
+
+def test_what_cannot_be_scored_together_is_refused(tmp_path: Path, workflow: Calls) -> None:
+    one = quick(tmp_path)
+    run_blind(one)
+    other = Blind(out=tmp_path / "more", suites=("clean",), runs=1, prior="ycb21-z2")
+    run_blind(other)
+    out = tmp_path / "none"
+    for folders, expected in (
+        ((one.out, tmp_path), "is no run of python -m eval.blind"),
+        ((one.out, other.out), "has the prior ycb21-z2"),
+    ):
+        with pytest.raises(RunError, match=expected):
+            combine(Combine(folders, out))
+    path = one.out / "verdicts-0.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(RunError, match="lacks 1 of 3 verdicts"):
+        combine(Combine((one.out,), out))
+    with pytest.raises(ValueError, match="folders is empty"):
+        Combine()
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"suites": ("large",)}, {"suites": ()}, {"runs": 0}, {"combine": (Path(),), "resume": True}],
+    [{"suites": ("large",)}, {"suites": ()}, {"runs": 0}],
 )
 def test_bad_settings_are_refused(wrong: dict) -> None:
-    with pytest.raises(ValueError, match="expected|not both"):
+    with pytest.raises(ValueError, match="expected"):
         Blind(**wrong)

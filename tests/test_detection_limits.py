@@ -69,6 +69,12 @@ def test_limits_are_told_in_units_that_people_read() -> None:
     assert ratio.shown == f"{ratio.size:.2g}"  # no unit
     assert adhesion.note == "needs lift-off"
     told = told_limits((weight, lever, ratio, adhesion))
-    expected = f"payload {weight.shown}, wall_friction {ratio.shown}; at no size that is expected:"
-    assert " ".join(told.split()).endswith(f"{expected} adhesion (needs lift-off)")
+    sizes = f"payload {weight.shown}, wall_friction log_ratio {ratio.shown}; "
+    expected = f"{sizes}at no size that is expected: adhesion (needs lift-off)"
+    assert " ".join(told.split()).endswith(expected)
     assert max(map(len, told.splitlines())) <= 100 and "lever" not in told
+    bias = detection_limits([glance_of("force_bias", (0.1, 0.1, 0.01))],
+                            [find_effect("force_bias")], needed, LEAST)  # fmt: skip
+    shown = [limit.shown for limit in bias]
+    expected = "force_bias F_x {} or F_z {} or tau {}".format(*shown)
+    assert expected in " ".join(told_limits(bias).split())

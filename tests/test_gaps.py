@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from scipy.stats import chi2
 from torch import Tensor
 
 from tpcd.data.episode import Episode
@@ -82,18 +81,49 @@ def test_each_contact_has_its_own_gap() -> None:
     assert {gap.contact for gap in found.channels} == {"all"}
 
 
-def test_intervals_are_as_wide_as_chance_makes_them() -> None:
-    """Of independent normal errors: chi-square with as many degrees of freedom as rows."""
-    n, generator = 400, torch.Generator().manual_seed(3)
-    error = torch.randn(n, 6, generator=generator, dtype=torch.float64)
+@pytest.mark.parametrize(("rows", "runs"), [(31, 1), (60, 6)])
+def test_intervals_hold_the_truth_as_often_as_they_say(rows: int, runs: int) -> None:
+    """Of independent normal errors, all of them or half of them in runs of one contact."""
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.full((rows, 6), 0.1, dtype=torch.float64)
+    contact = (torch.arange(rows) // runs) % 2
+    held = []
+    for _ in range(60):
+        error = torch.randn(rows, 6, generator=generator, dtype=torch.float64)
+        found = gaps(*(errors_of(error, noise, contact),) * 2, generator)
+        some = found.channels if runs == 1 else found.by_contact
+        held += [gap.before_low < 1.0 < gap.before_high for gap in some]
+    assert 0.85 < sum(held) / len(held) < 0.95
+
+
+def test_few_rows_of_a_contact_have_no_interval() -> None:
+    n = 40
     noise = torch.full((n, 6), 0.1, dtype=torch.float64)
-    contact = torch.arange(n) % 2
-    found = gaps(*(errors_of(error, noise, contact),) * 2, generator)
-    for rows, some in ((n, found.channels), (n // 2, found.by_contact)):
-        expected = math.sqrt(chi2.ppf(0.95, rows) / rows) - math.sqrt(chi2.ppf(0.05, rows) / rows)
-        widths = torch.tensor([gap.before_high - gap.before_low for gap in some])
-        assert float(widths.mean()) == pytest.approx(expected, rel=0.15)
-        assert all(gap.before_low < gap.before < gap.before_high for gap in some)
+    contact = torch.zeros(n, dtype=torch.long)
+    contact[20:24] = 1
+    off = torch.where(contact == 1, 4.0, 2.0)[:, None] * noise
+    before, after = errors_of(off, noise, contact), errors_of(noise, noise, contact)
+    found = {gap.contact: gap for gap in gaps(before, after, torch.Generator()).by_contact}
+    few, many = found["floor"], found["free"]
+    assert few.rows == 4 and few.before == pytest.approx(0.4) and few.closed == pytest.approx(1.0)
+    assert math.isnan(few.before_low) and math.isnan(few.closed_low)
+    assert many.before_low == pytest.approx(0.2) and many.closed_low == pytest.approx(1.0)
+
+
+def test_what_chance_may_make_has_no_interval() -> None:
+    """An excess of a fifth of the noise in the mean, of which many resamples have none."""
+    n, generator = 60, torch.Generator().manual_seed(1)
+    noise = torch.full((n, 6), 0.1, dtype=torch.float64)
+    shares = []
+    for _ in range(40):
+        error = 0.11 * torch.randn(n, 6, generator=generator, dtype=torch.float64)
+        found = gaps(errors_of(error, noise), errors_of(0.9 * error, noise), generator)
+        shares += [(found.share, found.low)]
+        shares += [(gap.closed, gap.closed_low) for gap in found.channels]
+    known = [(share, low) for share, low in shares if not math.isnan(share)]
+    assert 20 < len(known) < len(shares) - 20
+    assert all(math.isnan(low) for share, low in shares if math.isnan(share))
+    assert any(math.isnan(low) for _, low in known)
 
 
 def test_a_gap_of_which_no_row_is_known_is_none() -> None:

@@ -203,8 +203,8 @@ def write_results(
 ) -> Path:
     """Write `results.json` into an opened run: table, configuration, versions, seeds.
 
-    `table` is what was printed, one mapping for each row; `extra` adds further entries
-    beside it. Raises `RunError` when the folder was not made by `open_run`.
+    `table` is what was printed, or the numbers behind it, one mapping for each row; `extra` adds
+    further entries beside it. Raises `RunError` when the folder was not made by `open_run`.
     """
     import yaml
 

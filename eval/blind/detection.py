@@ -22,17 +22,26 @@ LIMITS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
 """Ends of bins of sizes relative to the detection limit that the report states."""
 SHOWN_ENDS = (0.25, 32.0)
 """Where open bins end in the figure."""
+BY_SIZE = ("small", "medium")
+"""Suites that differ in nothing but the size."""
 
 
 def single_effects(scores: Sequence[Score]) -> list[Score]:
     """Cases of one effect of the catalogue, by the whole workflow."""
-    return [s for s in scores if math.isfinite(s.size) and not SUITES[s.suite].without]
+    return [s for s in whole_workflow(scores) if math.isfinite(s.size)]
+
+
+def whole_workflow(scores: Sequence[Score]) -> list[Score]:
+    """Those of suites in which nothing is switched off."""
+    return [s for s in scores if not SUITES[s.suite].without]
 
 
 def detection_table(scores: Sequence[Score]) -> list[dict[str, Any]]:
-    """Share named exactly by size, relative to medium and to the limit stated in the report."""
+    """Share named exactly by size: relative to medium in the suites that differ in nothing else,
+    and relative to the limit that the report states in all."""
     chosen = single_effects(scores)
-    rows = _binned(chosen, "medium", SIZES, lambda s: s.size)
+    alike = [s for s in chosen if s.suite in BY_SIZE]
+    rows = _binned(alike, "medium", SIZES, lambda s: s.size)
     rows += _binned(chosen, "limit stated", LIMITS, lambda s: s.over_limit)
     return [
         {
@@ -54,10 +63,11 @@ def detection_figure(scores: Sequence[Score]) -> Figure | None:
     if not chosen:
         return None
     figure, axes = panels(1, 2, 4.2, 3.2)
-    sizes = ("size of the effect relative to medium", SIZES, lambda s: s.size)
-    limits = ("size relative to the detection limit stated", LIMITS, lambda s: s.over_limit)
-    for panel, (label, ends, value) in zip(axes, (sizes, limits), strict=True):
-        for _, low, high, count, _, runs in _binned(chosen, "", ends, value):
+    alike = [s for s in chosen if s.suite in BY_SIZE]
+    sizes = ("size of the effect relative to medium", alike, SIZES, lambda s: s.size)
+    limits = ("size relative to the detection limit stated", chosen, LIMITS, lambda s: s.over_limit)
+    for panel, (label, some, ends, value) in zip(axes, (sizes, limits), strict=True):
+        for _, low, high, count, _, runs in _binned(some, "", ends, value):
             low, high = max(low, SHOWN_ENDS[0]), min(high, SHOWN_ENDS[1])
             share, between = count / runs, share_interval(count, runs)
             panel.plot([low, high], [share, share], color=SERIES[0], linewidth=2)
@@ -74,10 +84,10 @@ def detection_figure(scores: Sequence[Score]) -> Figure | None:
         panel.set_xlabel(label)
     axes[1].axvline(1.0, color=TRUTH, linestyle="--", linewidth=1.0)
     axes[0].set_ylabel("share named exactly")
-    title(axes[0], f"{len(chosen)} cases of one effect")
-    title(axes[1], "numbers: cases of each bin")
+    title(axes[0], f"suites small and medium ({len(alike)} cases)")
+    title(axes[1], f"all suites ({len(chosen)} cases)")
     entries = {
-        "share": Line2D([], [], color=SERIES[0], linewidth=2),
+        "share, with the number of cases": Line2D([], [], color=SERIES[0], linewidth=2),
         "90 % interval": Line2D([], [], color=SERIES[0], linewidth=1),
         "limit": Line2D([], [], color=TRUTH, linestyle="--", linewidth=1.0),
     }
@@ -87,7 +97,7 @@ def detection_figure(scores: Sequence[Score]) -> Figure | None:
 
 def size_calibration(scores: Sequence[Score]) -> Figure | None:
     """Coverage of the intervals of effect sizes, as normal ones, where the effects are exact."""
-    deviations = np.array([one for s in scores for one in s.size_scores])
+    deviations = np.array([one for s in whole_workflow(scores) for one in s.size_scores])
     deviations = deviations[np.isfinite(deviations)]
     if not len(deviations):
         return None

@@ -5,28 +5,63 @@ from __future__ import annotations
 import csv
 import io
 import math
+import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
 
+from eval.blind.cases import outlines
 from eval.blind.detection import detection_figure, detection_table, size_calibration
 from eval.blind.marks import is_falsely_named, mark_table
 from eval.blind.score import Score, confusion, median_interval, rate, share_interval
 from eval.blind.suites import CLEAN, SUITES
+from eval.blind.trial import load_shape
 from tpcd.figures.sinks import save_figure
 from tpcd.figures.style import TEXT, panels, title
 from tpcd.files import write_text
-from tpcd.results import format_table
+from tpcd.results import format_table, write_results
 
 Row = dict[str, Any]
 
 
 LETTER = 0.085
 """Width of a letter of a name in a figure [in]."""
+
+
+def write_report(
+    scores: Sequence[Score],
+    failed: Sequence[Mapping[str, Any]],
+    folder: Path,
+    prior: str,
+    seeds: Sequence[int],
+    **extra: Any,
+) -> None:
+    """Print, draw and write what scores come to into a run folder; `failed` are the lines of cases
+    without a verdict, `prior` is the shape prior of all cases."""
+    note = _known_objects(load_shape(prior))
+    with SummaryWriter(folder / "tensorboard") as writer:
+        tables = report(scores, folder, writer)
+    others = {name: tables[name] for name in ("suites", "effects", "detection")}
+    write_results(
+        folder,
+        tables["marks"],
+        seeds=seeds,
+        **others,
+        cases=scores,
+        failed=failed,
+        note=note,
+        **extra,
+    )
+    if note:
+        print(f"\n{note}")
+    for line in failed:
+        print(f"failed: {line['case']}: {line['failed']}", file=sys.stderr)
+    print(f"results in {folder}")
 
 
 def report(scores: Sequence[Score], folder: Path, writer: Any) -> dict[str, list[Row]]:
@@ -142,3 +177,12 @@ def _rates(scores: Sequence[Score], is_clean: bool) -> Row:
 def _interval(count: int, runs: int) -> str:
     low, high = share_interval(count, runs)
     return f"{low:.2f}-{high:.2f}"
+
+
+def _known_objects(shape: Any) -> str:
+    """What to say of objects that the prior was trained on."""
+    trained = [str(name) for name in getattr(shape, "names", ())]
+    seen = [n for n in outlines() if any(t == n or t.startswith(f"{n}/") for t in trained)]
+    if not seen:
+        return ""
+    return f"The shape prior was trained on {len(seen)} of the {len(outlines())} objects."

@@ -55,7 +55,8 @@ class Score:
     size: float
     """Size of the one effect hidden, relative to the medium one; NaN for none, two, or others."""
     over_limit: float
-    """The same relative to the detection limit that is reported; NaN where none is."""
+    """The same relative to the detection limit that is reported: 0 where the report says that no
+    size shows, NaN where it has no limit of the effect."""
     closed: float
     """Share of the excess over the noise floor that is gone on fresh data: 0 where an effect is
     hidden and none was named, NaN where there is no excess."""
@@ -194,8 +195,8 @@ def _over_limits(
     hidden: Mapping[str, Mapping[str, float]], found: Mapping[str, Any]
 ) -> list[float]:
     """How many times the limits that are reported each effect hidden is: its parameters together,
-    each in parts of its limit, since their squares add up in what is gained. Infinite for one
-    without a limit."""
+    each in parts of its limit, since their squares add up in what is gained. 0 where the report
+    says that no size shows, infinite where it has no limit."""
     limits = {
         (one["name"], one["parameter"]): math.inf if one["size"] is None else one["size"]
         for one in found.get("detection_limits", ())

@@ -30,13 +30,20 @@ def _shown(gap: Gap, by_contact: bool) -> dict[str, str]:
     factor, unit = display_unit(gap.unit)
 
     def value(error: float, low: float, high: float) -> str:
-        return f"{factor * error:#.3g} ({factor * low:#.3g} to {factor * high:#.3g})"
+        ends = f" ({_digits(factor * low)} to {_digits(factor * high)})"
+        return _digits(factor * error) + (ends if math.isfinite(low) else "")
 
     place = {"contact": f"{gap.contact} ({gap.rows})"} if by_contact else {}
     return place | {
         "channel": f"{gap.channel} [{unit}]",
         "before": value(gap.before, gap.before_low, gap.before_high),
         "after": value(gap.after, gap.after_low, gap.after_high),
-        "noise": f"{factor * gap.noise_floor:#.3g}",
+        "noise": _digits(factor * gap.noise_floor),
         "closed": _closed(gap.closed, gap.closed_low, gap.closed_high),
     }
+
+
+def _digits(value: float) -> str:
+    """Three digits, without an exponent."""
+    places = 2 - math.floor(math.log10(value)) if value > 0 else 2
+    return f"{value:.{max(places, 0)}f}"

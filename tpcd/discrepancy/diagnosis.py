@@ -95,7 +95,8 @@ class Gap:
     """How many they are."""
     before: float
     before_low: float
-    """90 % interval, as all of these: of blocks of rows drawn with replacement."""
+    """90 % interval, as all of these: of blocks of rows drawn with replacement. NaN where there are
+    too few."""
     before_high: float
     after: float
     after_low: float
@@ -105,6 +106,7 @@ class Gap:
     closed: float
     """Share of the excess over the noise floor that is gone; NaN without an excess."""
     closed_low: float
+    """NaN also where chance may leave no excess."""
     closed_high: float
 
 

@@ -1,7 +1,9 @@
-"""How large the gap between prediction and measurement is before and after, and how much is closed.
+"""How large the gap between prediction and measurement is before and after, and what is closed.
 
-Errors are those of one-step predictions, of all rows and by what the rows touch; intervals come
-from a bootstrap of blocks of rows.
+Errors are those of one-step predictions, of all rows and by what the rows touch. A few rows that
+follow each other count as one block. Intervals of errors are those of Student's t for the
+logarithm of the mean square, intervals of shares those of a bootstrap of blocks, with percentiles
+as wide as so few blocks ask for (expanded percentile intervals: Hesterberg 2015).
 """
 
 from __future__ import annotations
@@ -17,9 +19,12 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy.coverage import contact_rows
 from tpcd.discrepancy.diagnosis import CHANNELS, Gap
 
-BLOCK = 5
-"""Transitions that the bootstrap keeps together."""
+BLOCK = 3
+"""Rows that the bootstrap keeps together: about as many as a touch lasts."""
+FEWEST_BLOCKS = 5
+"""With fewer there are no intervals."""
 RESAMPLES = 2000
+LEVEL = 0.9
 LEAST_EXCESS = 0.1
 """Share of the noise's variance that counts as a gap."""
 TYPICAL = 0.95
@@ -30,7 +35,6 @@ UNITS = ("m", "m", "rad", "N", "N", "N·m")
 ALL = "all"
 CONTACTS = ("free", "floor", "wall", "floor and wall")
 """What a row touches, as pose and command say (`contact_rows`)."""
-_ENDS = torch.tensor([0.05, 0.95], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Gaps:
     share: float
     """Share closed of the excess of all channels together, in units of the noise; NaN without."""
     low: float
-    """90 % interval of that share; NaN where chance alone makes such an excess."""
+    """90 % interval of that share; NaN where there is no share or chance may leave none."""
     high: float
 
 
@@ -75,18 +79,17 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> Gaps:
     if not len(floor):
         return Gaps((), (), math.nan, math.nan, math.nan)
     contact = before.contact[_known(before, after)]
-    draws = _block_draws(len(floor), generator)
     everything = torch.ones(len(floor), dtype=torch.bool)
-    channels = _of_rows(ALL, everything, squares, floor, draws)
+    channels = _of_rows(ALL, everything, squares, floor, generator)
     by_contact: list[Gap] = []
     for place, name in enumerate(CONTACTS):
         rows = contact == place
         if int(rows.sum()) >= FEWEST:
-            by_contact += _of_rows(name, rows, squares, floor, draws)
-    was, now = (part / floor for part in squares)
-    drawn = _together(was[draws].mean((1, 2)), now[draws].mean((1, 2)), was.numel())
-    share = _together(was.mean(), now.mean(), was.numel())
-    return Gaps(tuple(channels), tuple(by_contact), float(share), *_interval(drawn[:, None])[0])
+            by_contact += _of_rows(name, rows, squares, floor, generator)
+    each = torch.stack([(part / floor).mean(-1) for part in squares], dim=-1)
+    share = _together(*each.mean(0), floor.numel())
+    drawn = _together(*_resampled(each, generator).T, floor.numel())
+    return Gaps(tuple(channels), tuple(by_contact), float(share), *_ends(share, drawn, len(each)))
 
 
 def typical_share(before: Errors, after: Errors) -> float:
@@ -106,24 +109,21 @@ def _of_rows(
     rows: Bool[Tensor, " n"],
     squares: list[Float[Tensor, "n 6"]],
     floor: Float[Tensor, "n 6"],
-    draws: Int[Tensor, "r k"],
+    generator: torch.Generator,
 ) -> list[Gap]:
-    """The gap of each channel over some of the rows, with intervals of those that were drawn."""
+    """The gap of each channel over some of the rows."""
     count = int(rows.sum())
-    weight = rows[draws].double()
-    weight = weight / weight.sum(1, keepdim=True)  # NaN where none of the rows was drawn
-    means = [part[rows].mean(0) for part in (*squares, floor)]
-    drawn = [torch.einsum("rk,rkc->rc", weight, part[draws]) for part in (*squares, floor)]
-    closed, closes = _closed(*means, count), _closed(*drawn, count)
-    rms, was, now = [part.sqrt() for part in means], drawn[0].sqrt(), drawn[1].sqrt()
-    ends = [_interval(part) for part in (was, now, closes)]
+    table = torch.stack([part[rows] for part in (*squares, floor)], dim=1)
+    found = table.mean(0)
+    drawn = _resampled(table.flatten(1), generator).unflatten(1, found.shape)
+    closed, closes = _closed(*found, count), _closed(*drawn.unbind(1), count)
+    before, after, noise = found.sqrt().tolist()
+    ends = [_ends_of_errors(part[rows]) for part in squares]
     return [
         Gap(
             *(channel, UNITS[c], contact, count),
-            *(float(rms[0][c]), *ends[0][c]),
-            *(float(rms[1][c]), *ends[1][c]),
-            float(rms[2][c]),
-            *(float(closed[c]), *ends[2][c]),
+            *(before[c], *ends[0][c], after[c], *ends[1][c], noise[c]),
+            *(float(closed[c]), *_ends(closed[c], closes[:, c], count)),
         )
         for c, channel in enumerate(CHANNELS)
     ]
@@ -147,14 +147,57 @@ def _chance(count: int) -> float:
     return max(LEAST_EXCESS, 2.0 * math.sqrt(2.0 / count))
 
 
-def _interval(drawn: Float[Tensor, "r c"]) -> list[tuple[float, float]]:
-    """90 % interval of each column of what was drawn, as far as it is known."""
-    found = []
-    for column in drawn.T:
-        known = column[~column.isnan()]
-        low, high = torch.quantile(known, _ENDS).tolist() if len(known) else (math.nan, math.nan)
-        found.append((low, high))
-    return found
+def _blocks(values: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b 1"]]:
+    """Sums over blocks of rows, and numbers of rows."""
+    blocks = values.split(BLOCK)
+    sums = torch.stack([block.sum(0) for block in blocks])
+    return sums, values.new_tensor([[len(block)] for block in blocks])
+
+
+def _resampled(values: Float[Tensor, "n k"], generator: torch.Generator) -> Float[Tensor, "r k"]:
+    """Means over blocks of rows that are drawn with replacement."""
+    sums, counts = _blocks(values)
+    draws = torch.randint(len(sums), (RESAMPLES, len(sums)), generator=generator)
+    times = values.new_zeros(RESAMPLES, len(sums))
+    times.scatter_add_(1, draws, torch.ones_like(times))
+    return (times @ sums) / (times @ counts)
+
+
+def _quantile_of_t(blocks: int) -> float:
+    from scipy.stats import t
+
+    return float(t.ppf((1 + LEVEL) / 2, blocks - 1))
+
+
+def _ends_of_errors(squares: Float[Tensor, "n 6"]) -> list[tuple[float, float]]:
+    """90 % interval of the root mean square of each channel; NaN for too few rows."""
+    sums, counts = _blocks(squares)
+    if len(sums) < FEWEST_BLOCKS:
+        return [(math.nan, math.nan)] * squares.shape[1]
+    mean = squares.mean(0)
+    variance = (sums - counts * mean).square().sum(0) * len(sums) / (len(sums) - 1)
+    deviation = variance.sqrt() / (mean * len(squares))  # of the logarithm of the mean
+    factor = torch.exp(0.5 * _quantile_of_t(len(sums)) * deviation)
+    rms = mean.sqrt()
+    return list(zip((rms / factor).tolist(), (rms * factor).tolist(), strict=True))
+
+
+def _ends(share: Tensor, drawn: Float[Tensor, " r"], rows: int) -> tuple[float, float]:
+    """90 % interval of a share of so many rows; NaN where it is not known, or of more of those that
+    were drawn than the interval leaves out."""
+    from scipy.stats import norm
+
+    blocks = -(-rows // BLOCK)
+    known = drawn[~drawn.isnan()]
+    if blocks < FEWEST_BLOCKS or not bool(share.isfinite()):
+        return math.nan, math.nan
+    # Percentiles of few blocks are too narrow, by the factor of t and of the variance.
+    deviation = _quantile_of_t(blocks) * math.sqrt(blocks / (blocks - 1))
+    tail = float(norm.sf(deviation))
+    if len(known) < (1 - tail) * len(drawn):
+        return math.nan, math.nan
+    low, high = torch.quantile(known, known.new_tensor([tail, 1 - tail])).tolist()
+    return low, high
 
 
 def _known(before: Errors, after: Errors) -> Bool[Tensor, " n"]:
@@ -167,11 +210,3 @@ def _squares(before: Errors, after: Errors) -> list[Float[Tensor, "n 6"]]:
     """Squared errors before and after, and noise, of the rows that are known."""
     known = _known(before, after)
     return [torch.square(part[known]) for part in (before.error, after.error, after.noise)]
-
-
-def _block_draws(n: int, generator: torch.Generator) -> Int[Tensor, "r k"]:
-    """Rows (RESAMPLES, about n) of blocks drawn with replacement."""
-    starts = torch.arange(0, n, BLOCK)
-    chosen = starts[torch.randint(len(starts), (RESAMPLES, len(starts)), generator=generator)]
-    rows = chosen[..., None] + torch.arange(min(BLOCK, n))
-    return rows.flatten(1).clamp_max(n - 1)

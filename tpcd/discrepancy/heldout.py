@@ -17,11 +17,13 @@ from tpcd.belief.target import ContactTarget
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question, posterior
-from tpcd.discrepancy.gaps import BLOCK, RESAMPLES, Errors, contact_of
+from tpcd.discrepancy.gaps import RESAMPLES, Errors, contact_of
 from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 
 FOLDS = 4
+BLOCK = 5
+"""Transitions that the bootstrap of a gain keeps together."""
 FOLD_SAMPLER = SamplerSettings(
     particles=200,
     places=80,

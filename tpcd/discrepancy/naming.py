@@ -78,7 +78,8 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
         bench.glances.extend(glances)
         asked = [effect for effect in pool if effect.name not in current.names]
         limits = detection_limits(glances, asked, bench.coverage, settings.least_gain)
-        bench.tell(told_limits(limits))
+        if limits and not bench.candidates:  # once, whatever other base is taken
+            bench.tell(told_limits(limits))
     gains = promised_gains(bench, current, glances, number, reached)
     quick: dict[str, Fit] = {}
     lost = settings.from_prior and max(gains.values(), default=0.0) <= PROMISING[False]

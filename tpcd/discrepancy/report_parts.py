@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -129,23 +129,31 @@ def detection_limits(
 
 def told_limits(limits: Sequence[Limit]) -> str:
     """The limits in lines for people: what would show from which size on, and what would not."""
-    sizes: dict[str, list[str]] = {}
+    sizes: dict[str, list[Limit]] = {}
     none: dict[str, str] = {}
     for limit in limits:
         if math.isfinite(limit.size):
-            sizes.setdefault(limit.name, []).append(limit.shown)
+            sizes.setdefault(limit.name, []).append(limit)
         elif limit.note != NOT_ALONE:
             none[limit.name] = f"{limit.name} ({limit.note})" if limit.note else limit.name
-    shown = [f"{name} {' and '.join(found)}" for name, found in sizes.items()]
-    text = "preflight: "
-    text += f"an effect shows in these data from about: {_unbroken(shown)}; " if sizes else ""
-    text += f"at no size that is expected: {_unbroken(none.values())}" if none else ""
-    lines = textwrap.fill(text.removesuffix("; "), 100, subsequent_indent="    ")
+    text = []
+    if sizes:
+        shown = ", ".join(_told_sizes(*one) for one in sizes.items())
+        text.append(f"an effect shows in these data from about: {shown}")
+    if none:
+        text.append(f"at no size that is expected: {', '.join(none.values())}")
+    lines = textwrap.fill(
+        "preflight: " + "; ".join(text), 100, subsequent_indent="    ", break_on_hyphens=False
+    )
     return lines.replace(_HARD_SPACE, " ")
 
 
-def _unbroken(entries: Iterable[str]) -> str:
-    return ", ".join(entry.replace(" ", _HARD_SPACE) for entry in entries)
+def _told_sizes(name: str, limits: Sequence[Limit]) -> str:
+    """An effect with the size of each parameter, named where there are several or no unit tells."""
+    bare = len(limits) == 1 and " " in limits[0].shown
+    sizes = [one.shown if bare else f"{one.parameter} {one.shown}" for one in limits]
+    text = f"{name} {' or '.join(sizes)}"
+    return text.replace(" ", _HARD_SPACE) if len(sizes) < 3 else text
 
 
 def _with_unit(text: str, parameter: EffectParameter) -> str:

@@ -61,7 +61,9 @@ def diagnose(
     stop = _preflight(bench, episodes)
     if stop:
         tell(f"verdict: not enough information: {stop}")
-        limits = detection_limits((), settings.catalogue, bench.coverage, settings.least_gain)
+        given = {effect.name for effect in effects}
+        asked = [effect for effect in settings.catalogue if effect.name not in given]
+        limits = detection_limits((), asked, bench.coverage, settings.least_gain)
         counts = dict(bench.coverage.counts)
         found = Diagnosis("not_enough_information", stop, detection_limits=limits, coverage=counts)
     else:

@@ -90,6 +90,7 @@ def gap_bars(bars: Sequence[tuple[str, str, Interval, Interval, float]]) -> Figu
     for panel, (channel, si_unit, before, after, noise) in zip(axes, bars, strict=True):
         factor, unit = display_unit(si_unit)
         value, low, high = factor * np.array([before, after]).T
+        low, high = np.where(np.isfinite([low, high]), [low, high], value)  # too few rows
         ends = np.maximum([value - low, high - value], 0.0)
         panel.bar([0, 1], value, color=[BEFORE, AFTER], yerr=ends, ecolor="0.3", capsize=3)
         panel.axhline(factor * noise, color=TRUTH, linestyle="--", linewidth=1.0)

@@ -46,6 +46,7 @@ def a_diagnosis() -> Diagnosis:
         share_closed=0.95,
         share_closed_low=0.9,
         share_closed_high=0.99,
+        share_closed_typical=0.5,
         held_out="fresh episodes",
         cells_before=cells,
         cells_after=cells,
@@ -165,7 +166,12 @@ def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:
     with SummaryWriter(tmp_path / "tensorboard") as writer:
         page = write_diagnosis(found, [], 6.0, PRIOR, tmp_path, writer).read_text()
     for text in (
-        *("2.00 ± 0.10 mm per 10 N", "all channels: 95 % (90 to 99)", "needs lift-off", "30.0"),
+        *(
+            "2.00 ± 0.10 mm per 10 N",
+            "all channels: 95 % (90 to 99); in typical rows 50 %",
+            "needs lift-off",
+            "30.0",
+        ),
         *("floor and wall (7)", "z [mm]", "0.400 (0.300 to 0.500)", "100 % (90 to 100)"),
     ):
         assert text in page

@@ -233,7 +233,7 @@ def test_where_something_is_left_effects_must_close_half_of_the_gap(
 
     monkeypatch.setattr("tpcd.discrepancy.conclude.typical_share", closed)
     monkeypatch.setattr(
-        "tpcd.discrepancy.conclude.gaps", lambda *e: Gaps((), (), closed(*e[:2]), 0.0, 1.0)
+        "tpcd.discrepancy.conclude.gaps", lambda *e: Gaps((), (), closed(*e[:2]), 0.0, 1.0, 0.5)
     )
     monkeypatch.setattr(Workbench, "adequacy", lambda bench, fit: left)
     # What is closed on fresh episodes, here the rest, is shown and names nothing.

@@ -54,6 +54,7 @@ def test_a_row_in_another_contact_decides_nothing() -> None:
     assert gaps(before, after, torch.Generator().manual_seed(0)).share < 0.1
     # At most as far off as before: one row of forty.
     assert typical_share(before, after) == pytest.approx(1 - 1 / n)
+    assert gaps(before, after, torch.Generator()).typical == pytest.approx(1 - 1 / n)
     assert math.isnan(typical_share(errors_of(noise, noise), errors_of(noise, noise)))
     assert typical_share(before, errors_of(6 * noise, noise)) == 0.0
     # What shows in a few rows and channels alone is a gap.

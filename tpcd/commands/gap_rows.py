@@ -15,8 +15,10 @@ def shown_gaps(gaps: Sequence[Gap], by_contact: bool = False) -> list[dict[str, 
 
 
 def shown_share(found: Diagnosis) -> str:
-    """What is closed of the gap of all channels together, as text: `95 % (90 to 99)`."""
-    return _closed(found.share_closed, found.share_closed_low, found.share_closed_high)
+    """What is closed of the gap of all channels together, as text: `95 % (90 to 99)`, and of that
+    in typical rows, in which those that land in another contact decide nothing."""
+    share = _closed(found.share_closed, found.share_closed_low, found.share_closed_high)
+    return f"{share}; in typical rows {_closed(found.share_closed_typical, math.nan, math.nan)}"
 
 
 def _closed(share: float, low: float, high: float) -> str:

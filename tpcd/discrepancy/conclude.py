@@ -60,7 +60,7 @@ def conclude(
 ) -> Diagnosis:
     """The verdict, its effects, and the gap before and after."""
     settings = bench.settings
-    gap = Gaps((), (), math.nan, math.nan, math.nan)
+    gap = Gaps((), (), *(math.nan,) * 4)
     left = settings.adequacy and not found.after.adequate(settings.level)
     held: list[Errors] | None = None
     if found.final is not found.base and left:
@@ -99,6 +99,7 @@ def conclude(
         share_closed=gap.share,
         share_closed_low=gap.low,
         share_closed_high=gap.high,
+        share_closed_typical=gap.typical,
         held_out="fresh episodes" if fresh else "blocks held out",
         cells_before=found.before.cells,
         cells_after=found.after.cells,

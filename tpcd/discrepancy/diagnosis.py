@@ -150,6 +150,9 @@ class Diagnosis:
     share_closed_low: float = float("nan")
     """90 % interval of that share."""
     share_closed_high: float = float("nan")
+    share_closed_typical: float = float("nan")
+    """The same where no number counts for more than in 95 % of the rows before: a row that lands in
+    another contact decides nothing."""
     held_out: str = ""
     """Which data the gap was measured on."""
     cells_before: tuple[Cell, ...] = ()

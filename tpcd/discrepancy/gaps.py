@@ -61,6 +61,8 @@ class Gaps:
     low: float
     """90 % interval of that share; NaN where there is no share or chance may leave none."""
     high: float
+    typical: float
+    """That share by `typical_share`."""
 
 
 def contact_of(episode: Episode) -> Int[Tensor, " n"]:
@@ -77,7 +79,7 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> Gaps:
     """
     *squares, floor = _squares(before, after)
     if not len(floor):
-        return Gaps((), (), math.nan, math.nan, math.nan)
+        return Gaps((), (), *(math.nan,) * 4)
     contact = before.contact[_known(before, after)]
     everything = torch.ones(len(floor), dtype=torch.bool)
     channels = _of_rows(ALL, everything, squares, floor, generator)
@@ -89,7 +91,9 @@ def gaps(before: Errors, after: Errors, generator: torch.Generator) -> Gaps:
     each = torch.stack([(part / floor).mean(-1) for part in squares], dim=-1)
     share = _together(*each.mean(0), floor.numel())
     drawn = _together(*_resampled(each, generator).T, floor.numel())
-    return Gaps(tuple(channels), tuple(by_contact), float(share), *_ends(share, drawn, len(each)))
+    ends = _ends(share, drawn, len(each))
+    typical = typical_share(before, after)
+    return Gaps(tuple(channels), tuple(by_contact), float(share), *ends, typical)
 
 
 def typical_share(before: Errors, after: Errors) -> float:

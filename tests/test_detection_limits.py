@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import torch
 from scipy.integrate import quad
 
 from tpcd.discrepancy.coverage import NEEDED, Coverage
-from tpcd.discrepancy.report_parts import NOT_ALONE, detection_limits, told_limits
+from tpcd.discrepancy.diagnosis import Limit
+from tpcd.discrepancy.limits import NOT_ALONE, detection_limits, told_limits
 from tpcd.discrepancy.screening import Glance
 from tpcd.effects import find_effect
 from tpcd.effects.protocol import EffectParameter
@@ -78,3 +80,22 @@ def test_limits_are_told_in_units_that_people_read() -> None:
     shown = [limit.shown for limit in bias]
     expected = "force_bias F_x {} or F_z {} or tau {}".format(*shown)
     assert expected in " ".join(told_limits(bias).split())
+
+
+def test_where_the_likelihood_jumps_the_change_of_innovations_tells() -> None:
+    """Nothing happens to a ratio of 1.2; at 1.4 some transitions stick that slipped."""
+    effect = find_effect("static_kinetic")
+    blind = [glance_of("static_kinetic", (9.0,))]
+
+    def limit(*reach: tuple[float, float], seen: Sequence[Glance] = blind) -> Limit:
+        (found,) = detection_limits(seen, [effect], EXCITED, LEAST, {effect.name: (reach,)})
+        return found
+
+    jump = limit((0.1, 0.0), (0.2, 0.5), (0.4, 6.0), (0.8, 20.0))
+    assert jump.size == 0.4 and jump.note == ""
+    assert jump.shown == "1.4"  # what is called a ratio is told as one
+    # That much gains what is asked for, its prior paid: 18 - log(1 / (0.4 / 6 sqrt(2 pi))) > 6.
+    assert log_mean_likelihood(effect.parameters[0], 1.4, 0.4 / 6.0) > LEAST
+    faint = limit((0.1, 0.0), (0.2, 0.5), (0.4, 3.4), (0.8, 3.4))  # 5.8 nats
+    assert faint.size == math.inf and faint.shown == "none"
+    assert limit((0.1, 9.0), seen=[glance_of(effect.name, (0.02,))]).size < 0.1  # by curvature

@@ -17,7 +17,6 @@ from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
 from tpcd.discrepancy.conclude import Findings, conclude
-from tpcd.discrepancy.confusion import confusions, signatures
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import fit_model
@@ -314,35 +313,6 @@ def test_two_tests_without_theta_split_the_catalogue(
 
 def test_rows_too_few_to_be_sure_of_say_nothing_of_free_space(clean: Episode) -> None:
     assert free_space_score([clean.first(4)]) is None
-
-
-def test_effects_that_do_the_same_to_the_data_are_called_confusions() -> None:
-    one = torch.tensor([[0.0, 3.0, 4.0]], dtype=torch.float64)
-    plane = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    found = confusions({"a": one, "b": plane, "weak": 0.1 * one})
-    assert [(c.name, c.other) for c in found] == [("a", "b"), ("a", "weak")]
-    assert found[0].likeness == pytest.approx(1.0)
-    # Of b's first direction, a explains 3 / 5.
-    assert confusions({"b": 2 * plane, "a": one})[0].name == "a"
-
-
-def test_press_and_slide_hardly_tell_gain_from_stiffness(shape: PolygonShape) -> None:
-    generator = torch.Generator().manual_seed(5)
-    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
-    motion = make_motion("press_and_slide", scene, 60, generator)
-    truth = make_truth(scene, "quasistatic", {}, 60)
-    poor = record(truth, scene, motion, 60, generator).measured
-    alike = []
-    for episode in (recorded({}, steps=60), poor):
-        question = Question(
-            joined_history([episode]), make_prior(shape), MisfitField(1e-4, 1.0), StepSettings(),
-            SMALL.sampler,
-        )  # fmt: skip
-        effects = [find_effect(n) for n in ("force_gain", "stiffness_error")]
-        own, other = signatures(question, fit_model(question, (), (0,)), effects).values()
-        span = torch.linalg.qr(other.T).Q
-        alike.append(float((span.T @ own[0]).norm() / own[0].norm()))
-    assert alike[1] > alike[0] + 0.03
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.85])

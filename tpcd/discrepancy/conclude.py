@@ -15,7 +15,8 @@ from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question, joined_fit, posterior
 from tpcd.discrepancy.gaps import Errors, Gaps, gaps, typical_share
 from tpcd.discrepancy.heldout import held_out_errors, prediction_errors
-from tpcd.discrepancy.report_parts import detection_limits, named_effects, theta_estimates
+from tpcd.discrepancy.limits import limits_of
+from tpcd.discrepancy.report_parts import named_effects, theta_estimates
 from tpcd.discrepancy.settings import ENOUGH_DRAWS, FEWEST_DRAWS, REPORTED_SEEDS
 from tpcd.discrepancy.variants import NUMERICS, Variant
 from tpcd.discrepancy.workbench import Close, Workbench
@@ -108,12 +109,7 @@ def conclude(
         theta_before=theta_estimates(first),
         theta_after=theta_estimates(belief),
         shape=shape,
-        detection_limits=detection_limits(
-            bench.glances,
-            [effect for effect in settings.catalogue if effect.name not in found.given.names],
-            bench.coverage,
-            settings.least_gain,
-        ),
+        detection_limits=limits_of(bench, found.given.names),
         confusions=tuple(bench.confusions),
         tests=dict(bench.tests),
         coverage=dict(bench.coverage.counts),

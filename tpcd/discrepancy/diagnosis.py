@@ -117,8 +117,9 @@ class Limit:
     name: str
     parameter: str
     size: float
-    """In SI units; infinite where the excitation is missing."""
+    """Distance from the null value in SI units; infinite where no size shows."""
     shown: str
+    """The value at that distance, in the unit in which people read it."""
     note: str = ""
 
 

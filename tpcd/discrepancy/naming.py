@@ -15,10 +15,11 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.discrepancy.confusion import confusions, signatures
+from tpcd.discrepancy.confusion import confusions, reach_of, signatures
 from tpcd.discrepancy.diagnosis import Candidate
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit
+from tpcd.discrepancy.limits import limits_of, told_limits
 from tpcd.discrepancy.promises import (
     draws_agree,
     looks_at,
@@ -26,7 +27,6 @@ from tpcd.discrepancy.promises import (
     quick_fits,
     seen_itself,
 )
-from tpcd.discrepancy.report_parts import detection_limits, told_limits
 from tpcd.discrepancy.settings import (
     AMBIGUOUS,
     ASTRAY,
@@ -56,11 +56,15 @@ def find_confusions(bench: Workbench, base: Fit) -> None:
     """Note which effects these data could not tell apart, whatever their truth is."""
     found: dict[str, Float[Tensor, "k r"]] = {}
     for effect in bench.settings.catalogue:
-        own = bench.attempt(
-            f"{effect.name} failed in the preflight",
-            lambda e=effect: signatures(bench.question, base, [e]),
-        )
-        found |= own or {}
+
+        def own(effect: Effect = effect) -> Float[Tensor, "k r"]:
+            rows = signatures(bench.question, base, [effect])[effect.name]
+            bench.reach[effect.name] = reach_of(bench.question, base, effect, rows)
+            return rows
+
+        rows = bench.attempt(f"{effect.name} failed in the preflight", own)
+        if rows is not None:
+            found[effect.name] = rows
     bench.confusions[:] = confusions(found)
     if bench.confusions:
         pairs = ", ".join(f"{c.name} from {c.other}" for c in bench.confusions)
@@ -76,10 +80,8 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     glances = looks_at(bench, current, pool, number, fresh)
     if number == 1 and not bench.glances:
         bench.glances.extend(glances)
-        asked = [effect for effect in pool if effect.name not in current.names]
-        limits = detection_limits(glances, asked, bench.coverage, settings.least_gain)
-        if limits and not bench.candidates:  # once, whatever other base is taken
-            bench.tell(told_limits(limits))
+        if glances and not bench.candidates:  # once, whatever other base is taken
+            bench.tell(told_limits(limits_of(bench, current.names)))
     gains = promised_gains(bench, current, glances, number, reached)
     quick: dict[str, Fit] = {}
     lost = settings.from_prior and max(gains.values(), default=0.0) <= PROMISING[False]

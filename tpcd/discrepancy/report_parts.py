@@ -1,27 +1,18 @@
-"""Parts of a diagnosis in plain values: effects with their sizes, theta, detection limits."""
+"""Parts of a diagnosis in plain values: effects with their sizes, and theta."""
 
 from __future__ import annotations
 
 import math
-import textwrap
-from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
 from tpcd.belief.belief import Belief
 from tpcd.contact import place_points
-from tpcd.discrepancy.coverage import Coverage
-from tpcd.discrepancy.diagnosis import Estimate, Limit, NamedEffect
-from tpcd.discrepancy.screening import Glance
-from tpcd.effects.protocol import Effect, EffectParameter
+from tpcd.discrepancy.diagnosis import Estimate, NamedEffect
+from tpcd.effects.protocol import EffectParameter
 
 SIZES = ("object_width", "object_height")
 """Names of the outline's extents."""
-BEYOND, NOT_ALONE = "beyond its prior", "not without the other parameters"
-"""Why a parameter has no limit."""
-_HARD_SPACE = "\0"
-"""Where lines are not broken."""
 
 
 def named_effects(belief: Belief, given: int) -> tuple[NamedEffect, ...]:
@@ -84,89 +75,13 @@ def shown_value(value: float, sd: float, parameter: EffectParameter) -> str:
     value, sd = value * parameter.shown_factor, sd * parameter.shown_factor
     digits = 2 if sd <= 0 or not math.isfinite(sd) else max(0, 1 - math.floor(math.log10(sd)))
     digits = min(digits, 6)
-    return _with_unit(f"{value:.{digits}f} ± {sd:.{digits}f}", parameter)
+    return with_unit(f"{value:.{digits}f} ± {sd:.{digits}f}", parameter)
 
 
-def detection_limits(
-    glances: Sequence[Glance],
-    catalogue: Sequence[Effect],
-    coverage: Coverage,
-    least_gain: float,
-) -> tuple[Limit, ...]:
-    """For each effect the smallest size that the data would show, by the quick look's curvature.
-
-    A size of s standard deviations gains s^2 / 2 of log likelihood, less what the priors of all
-    parameters of the effect cost (by Laplace's approximation, as if they were independent).
-    """
-    known = {g.effect.name: g for g in glances}
-    limits: list[Limit] = []
-    for effect in catalogue:
-        lacks = coverage.missing(effect.needs)
-        found = known.get(effect.name)
-        cost = 0.0 if found is None else sum(map(_cost, effect.parameters, found.sd))
-        own = []
-        for k, parameter in enumerate(effect.parameters):
-            if parameter.low <= parameter.null <= parameter.high and parameter.name == "at":
-                continue
-            size, note = math.inf, ""
-            if lacks:
-                note = f"needs {', '.join(lacks)}"
-            if found is not None:
-                sd = found.sd[k]
-                size = sd * math.sqrt(2 * (least_gain + cost)) if sd > 0 else math.inf
-                if size > max(parameter.high - parameter.null, parameter.null - parameter.low):
-                    size, note = math.inf, note or BEYOND
-            shown = _with_unit(f"{size * parameter.shown_factor:.2g}", parameter)
-            shown = shown if math.isfinite(size) else "none"
-            own.append(Limit(effect.name, parameter.name, size, shown, note))
-        some = any(math.isfinite(limit.size) for limit in own)
-        limits += [
-            replace(limit, note=NOT_ALONE) if some and limit.note == BEYOND else limit
-            for limit in own
-        ]
-    return tuple(limits)
-
-
-def told_limits(limits: Sequence[Limit]) -> str:
-    """The limits in lines for people: what would show from which size on, and what would not."""
-    sizes: dict[str, list[Limit]] = {}
-    none: dict[str, str] = {}
-    for limit in limits:
-        if math.isfinite(limit.size):
-            sizes.setdefault(limit.name, []).append(limit)
-        elif limit.note != NOT_ALONE:
-            none[limit.name] = f"{limit.name} ({limit.note})" if limit.note else limit.name
-    text = []
-    if sizes:
-        shown = ", ".join(_told_sizes(*one) for one in sizes.items())
-        text.append(f"an effect shows in these data from about: {shown}")
-    if none:
-        text.append(f"at no size that is expected: {', '.join(none.values())}")
-    lines = textwrap.fill(
-        "preflight: " + "; ".join(text), 100, subsequent_indent="    ", break_on_hyphens=False
-    )
-    return lines.replace(_HARD_SPACE, " ")
-
-
-def _told_sizes(name: str, limits: Sequence[Limit]) -> str:
-    """An effect with the size of each parameter, named where there are several or no unit tells."""
-    bare = len(limits) == 1 and " " in limits[0].shown
-    sizes = [one.shown if bare else f"{one.parameter} {one.shown}" for one in limits]
-    text = f"{name} {' or '.join(sizes)}"
-    return text.replace(" ", _HARD_SPACE) if len(sizes) < 3 else text
-
-
-def _with_unit(text: str, parameter: EffectParameter) -> str:
+def with_unit(text: str, parameter: EffectParameter) -> str:
+    """A number as text with the unit in which people read it, which a mere number has not."""
     unit = parameter.shown_unit or parameter.unit
     return text if unit == "1" else f"{text} {unit}"
-
-
-def _cost(parameter: EffectParameter, sd: float) -> float:
-    """The logarithm of how much more the prior holds than the posterior."""
-    if not sd > 0:
-        return math.inf
-    share = (parameter.high - parameter.low) / (sd * math.sqrt(2 * math.pi))
-    return math.log(share) if share > 1 else 0.0
 
 
 def _shown(estimate: Estimate, parameter: EffectParameter) -> Estimate:

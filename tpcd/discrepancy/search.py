@@ -24,10 +24,10 @@ from tpcd.discrepancy.coverage import contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.exchange import Exchanges, exchanged
 from tpcd.discrepancy.fit import Fit, Question
+from tpcd.discrepancy.limits import limits_of
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import find_confusions, name_one
 from tpcd.discrepancy.pruning import needless, pruned
-from tpcd.discrepancy.report_parts import detection_limits
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import FEWEST_ROWS, DiagnosisSettings
 from tpcd.discrepancy.variants import FINER, Variant, step_halving
@@ -61,9 +61,7 @@ def diagnose(
     stop = _preflight(bench, episodes)
     if stop:
         tell(f"verdict: not enough information: {stop}")
-        given = {effect.name for effect in effects}
-        asked = [effect for effect in settings.catalogue if effect.name not in given]
-        limits = detection_limits((), asked, bench.coverage, settings.least_gain)
+        limits = limits_of(bench, [effect.name for effect in effects])
         counts = dict(bench.coverage.counts)
         found = Diagnosis("not_enough_information", stop, detection_limits=limits, coverage=counts)
     else:

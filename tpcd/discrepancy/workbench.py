@@ -10,6 +10,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
+from tpcd.discrepancy.confusion import Reach
 from tpcd.discrepancy.coverage import Coverage
 from tpcd.discrepancy.diagnosis import Candidate, Confusion
 from tpcd.discrepancy.evidence import fit_model
@@ -49,6 +50,8 @@ class Workbench:
     glances: list[Glance] = field(default_factory=list)
     """Of the first round."""
     confusions: list[Confusion] = field(default_factory=list)
+    reach: dict[str, tuple[Reach, ...]] = field(default_factory=dict)
+    """What each parameter of an effect does to the innovations, beyond theta."""
     tests: dict[str, float] = field(default_factory=dict)
     """What needs no theta: mean chi-square of parity and of free space, with probabilities."""
     left: dict[str, Adequacy] = field(default_factory=dict)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from diagnosis_bench import SETTINGS
 
 from tpcd.belief.history import joined_history
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
-from tpcd.belief.settings import SamplerSettings
 from tpcd.discrepancy.confusion import FAINT, SHARES, confusions, reach_of, signatures
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question
@@ -18,17 +18,6 @@ from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
 from tpcd.truth.recording import Policy, make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
-
-SAMPLER = SamplerSettings(
-    particles=150,
-    draws_per_place=9,
-    draws=600,
-    prior_draws=200,
-    fresh_modes=40,
-    modes=8,
-    rounds=2,
-    places=40,
-)
 
 
 def fitted(policy: Policy) -> tuple[Question, Fit]:
@@ -44,7 +33,7 @@ def fitted(policy: Policy) -> tuple[Question, Fit]:
         make_prior(PolygonShape(outline)),
         MisfitField(1e-4, 1.0),
         StepSettings(),
-        SAMPLER,
+        SETTINGS.sampler,
     )
     return question, fit_model(question, (), (0,))
 

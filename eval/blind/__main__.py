@@ -128,16 +128,12 @@ def score(config: Blind) -> None:
     there is no verdict.
     """
     from eval.blind.pages import write_report
-    from eval.blind.score import score_verdicts
-    from eval.blind.trial import read_verdicts
+    from eval.blind.score import FAILED, read_scores
 
-    verdicts, failed = read_verdicts(config.out)
-    if not verdicts:
+    scores, failed = read_scores([config.out])
+    if all(one.verdict == FAILED["verdict"] for one in scores):
         why = failed[0]["failed"] if failed else "none was run"
         raise ValueError(f"no case of {len(failed)} has a verdict; the first: {why}")
-    # Where the workflow itself failed, it has found nothing.
-    sealed = [line for line in failed if "key_sha256" in line]
-    scores = score_verdicts(config.out, [*verdicts, *sealed])
     write_report(scores, failed, config.out, config.prior, (case_seed(config),))
 
 

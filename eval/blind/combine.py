@@ -5,17 +5,12 @@ python -m eval.blind.combine runs/medium runs/small runs/clean --out runs/all
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from eval.blind.__main__ import COMMAND, Blind, case_seed, cases_of
 from tpcd.cli import run
-
-if TYPE_CHECKING:
-    from eval.blind.score import Score
 
 
 @dataclass(frozen=True)
@@ -37,6 +32,7 @@ class Combine:
 def combine(config: Combine) -> None:
     """Open the keys of all folders, score, print and draw."""
     from eval.blind.pages import write_report
+    from eval.blind.score import read_scores
     from tpcd.errors import RunError
     from tpcd.results import run_folder
 
@@ -57,32 +53,6 @@ def combine(config: Combine) -> None:
         ]  # fmt: skip
         seeds = tuple(dict.fromkeys(case_seed(asked) for asked, _ in runs.values()))
         write_report(scores, failed, out, runs[first][0].prior, seeds, runs=told)
-
-
-def read_scores(folders: Sequence[Path]) -> tuple[list[Score], list[dict[str, Any]]]:
-    """The scores of all cases of some folders, and the lines of those that only failed.
-
-    A case that several hold is that of the first with a verdict.
-    """
-    from eval.blind.score import score_verdicts
-    from eval.blind.trial import read_verdicts
-
-    good: dict[str, tuple[Path, dict[str, Any]]] = {}
-    bad: dict[str, tuple[Path, dict[str, Any]]] = {}
-    count = 0
-    for folder in folders:
-        for lines, kept in zip(read_verdicts(folder), (good, bad), strict=True):
-            count += len(lines)
-            for line in lines:
-                kept.setdefault(line["case"], (folder, line))
-    bad = {case: found for case, found in bad.items() if case not in good}
-    if count > len(good) + len(bad):
-        twice = count - len(good) - len(bad)
-        print(f"{twice} cases are in several folders and count once", file=sys.stderr)
-    # Where the workflow itself failed, it has found nothing.
-    sealed = [*good.values(), *(one for one in bad.values() if "key_sha256" in one[1])]
-    scores = [one for folder, line in sealed for one in score_verdicts(folder, [line])]
-    return scores, [line for _, line in bad.values()]
 
 
 def _finished_run(folder: Path) -> tuple[Blind, dict[str, Any]]:

@@ -8,6 +8,7 @@ that. Shares have exact (Clopper-Pearson) 90 % intervals, medians those of order
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from scipy.stats import binom, binomtest
 from eval.blind.cases import null_value
 from eval.blind.sealing import Seal, open_key
 from eval.blind.suites import MEDIUM, PLACES
+from eval.blind.trial import read_verdicts
 
 NUMERICS = "numerics"
 """The one name that stands for no physics."""
@@ -82,6 +84,29 @@ class Score:
 def score_verdicts(folder: Path, lines: Iterable[Mapping[str, Any]]) -> list[Score]:
     """Open the keys, after all verdicts; raises `RunError` where one is not the sealed one."""
     return [score_line(open_key(folder, seal_of(line)), line) for line in lines]
+
+
+def read_scores(folders: Sequence[Path]) -> tuple[list[Score], list[dict[str, Any]]]:
+    """The scores of all cases of some folders, and the lines of those that only failed.
+
+    A case that several hold is that of the first with a verdict.
+    """
+    good: dict[str, tuple[Path, dict[str, Any]]] = {}
+    bad: dict[str, tuple[Path, dict[str, Any]]] = {}
+    count = 0
+    for folder in folders:
+        for lines, kept in zip(read_verdicts(folder), (good, bad), strict=True):
+            count += len(lines)
+            for line in lines:
+                kept.setdefault(line["case"], (folder, line))
+    bad = {case: found for case, found in bad.items() if case not in good}
+    if count > len(good) + len(bad):
+        twice = count - len(good) - len(bad)
+        print(f"{twice} cases are in several folders and count once", file=sys.stderr)
+    # Where the workflow itself failed, it has found nothing.
+    sealed = [*good.values(), *(one for one in bad.values() if "key_sha256" in one[1])]
+    scores = [one for folder, line in sealed for one in score_verdicts(folder, [line])]
+    return scores, [line for _, line in bad.values()]
 
 
 def seal_of(line: Mapping[str, Any]) -> Seal:

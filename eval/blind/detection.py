@@ -101,7 +101,7 @@ def size_calibration(scores: Sequence[Score]) -> Figure | None:
     deviations = deviations[np.isfinite(deviations)]
     if not len(deviations):
         return None
-    return calibration(norm.cdf(deviations)[:, None], ["sizes of effects, by mean and sd"], "sizes")
+    return calibration(norm.cdf(deviations)[:, None], ["normal intervals"], "sizes")
 
 
 def _binned(

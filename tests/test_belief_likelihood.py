@@ -169,6 +169,31 @@ def test_compiled_loops_and_torch_agree_where_the_ground_gives_way(
     assert (found.total[likely] - plain[likely]).abs().max() > 1
 
 
+def test_compiled_loops_and_torch_agree_where_outlines_are_warped(
+    shape: PolygonShape, episode: Episode, particles: Tensor
+) -> None:
+    """Each row by up to 2 mm of its own; where by no number, that particle alone is impossible."""
+    history = history_of(episode)
+    scene = scene_from_parameters(shape, Parameters.from_vector(particles))
+    setting = history.setting(scene)
+    count, points = scene.points_ee.shape[:2]
+    generator = torch.Generator().manual_seed(5)
+    warp = torch.rand(count, len(episode), points, 2, generator=generator, dtype=torch.float64)
+    warp = 2e-3 * warp
+    warp[1, 3, 0] = torch.nan
+    setting = replace(setting, conditions=replace(setting.conditions, warp=warp))
+    sd = torch.full((count,), FIELD.sd, dtype=torch.float64)
+    found = compiled_filter(scene.points_ee, setting, sd, FIELD, StepSettings())
+    expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
+    assert found.total[1] == expected.total[1] == -torch.inf
+    others = torch.arange(count) != 1
+    assert torch.isfinite(found.total[others]).any()
+    torch.testing.assert_close(found.total[others], expected.total[others], rtol=1e-8, atol=1e-8)
+    likely = torch.isfinite(found.total)
+    plain = evaluate(shape, particles, history).total
+    assert (found.total[likely] - plain[likely]).abs().max() > 1
+
+
 @pytest.mark.parametrize("effect", ["floor_compliance", "grasp_compliance", "force_bias"])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_where_no_particle_has_a_chance_none_is_evaluated(

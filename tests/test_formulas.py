@@ -5,18 +5,42 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
-from injected_parts import FORCE, LENGTH, WEDGE, follow, lowest, make_scene, vector
+from injected_parts import FORCE, LENGTH, SLAB, WEDGE, follow, lowest, make_scene, vector
 
+from tpcd.effects import conditions
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.truth.injected_world import STEP_LENGTH
 
 SLIDES = ((0.02, 0.02, 0), (0.06, 0.02, 0), (0.03, 0.02, 0), (-0.02, 0.02, 0), (0.01, 0.0, 0))
+PRESSED = (
+    (0.02, 0.02, 0),
+    (0.06, 0.0, 0),
+    (0.09, -0.02, 0),
+    (0.03, -0.02, 0),
+    (-0.02, -0.03, 0.02),
+)
+RIPPLES = (
+    {"floor_ripple": {"height": 0.0015, "length": 0.06}},
+    {"floor_height ~ wave": {"sine": 0.0015, "length": 0.06}},
+)
+DENT = (
+    {"floor_bump": {"height": -0.003, "x": 0.03}},
+    {"floor_height ~ bump": {"height": -0.003, "place": 0.03, "width": 0.012}},
+)
+BUMP = (
+    {"floor_bump": {"height": 0.003, "x": 0.03}},
+    {"floor_height ~ bump": {"height": 0.003, "place": 0.03, "width": 0.012}},
+)
+Hidden = dict[str, dict[str, float]]
 
 
-def modelled(hidden: dict[str, dict[str, float]], friction: float) -> np.ndarray:
-    """Poses and readings (n, 6) of the model over `SLIDES`."""
-    scene = make_scene(WEDGE, friction=friction)
+def modelled(
+    hidden: Hidden, friction: float, commands=SLIDES, vertices: torch.Tensor = WEDGE
+) -> np.ndarray:
+    """Poses and readings (n, 6) of the model over the commands."""
+    scene = make_scene(vertices, friction=friction)
     truth = EffectTruth(
         scene.vertices_ee,
         scene.friction,
@@ -24,10 +48,28 @@ def modelled(hidden: dict[str, dict[str, float]], friction: float) -> np.ndarray
         scene.wall_position,
         scene.stiffness,
         added_effects(hidden),
-        len(SLIDES),
+        len(commands),
     )
     truth.reset(scene.start_pose)
-    return np.array([torch.cat(truth.step(vector(*command))[:2]).tolist() for command in SLIDES])
+    return np.array([torch.cat(truth.step(vector(*command))[:2]).tolist() for command in commands])
+
+
+def errors(
+    law: tuple[Hidden, Hidden], friction: float, commands=PRESSED, vertices: torch.Tensor = WEDGE
+) -> tuple[np.ndarray, np.ndarray]:
+    """Largest errors of pose [m, m, rad], command by command, with the formula and without."""
+    true = follow(law[0], *commands, vertices=vertices, friction=friction)[:, :3]
+    close = subdivided(vertices)
+    found = (modelled(hidden, friction, commands, close)[:, :3] for hidden in (law[1], {}))
+    with_it, without = (np.abs(poses - true).max(axis=1) for poses in found)
+    return with_it, without
+
+
+def subdivided(vertices: torch.Tensor, count: int = 40) -> torch.Tensor:
+    """The outline with so many points on each side, as decoded ones have."""
+    share = torch.arange(count, dtype=torch.float64)[:, None, None] / count
+    sides = vertices + share * (vertices.roll(-1, 0) - vertices)
+    return sides.transpose(0, 1).flatten(0, 1)
 
 
 def test_a_wave_is_a_rippled_floor() -> None:
@@ -41,6 +83,34 @@ def test_a_wave_is_a_rippled_floor() -> None:
     assert np.ptp(z) > height
     assert np.allclose(ours[:, :2], true[:, :2], atol=5 * LENGTH)
     assert np.allclose(ours[:, 3:5], true[:, 3:5], atol=5 * FORCE)
+
+
+@pytest.mark.parametrize(
+    ("law", "friction"), [(RIPPLES, 0.7), (DENT, 0.2), (DENT, 0.7), (BUMP, 0.2)]
+)
+def test_what_is_pressed_hard_slides_over_an_uneven_floor(
+    law: tuple[Hidden, Hidden], friction: float
+) -> None:
+    with_it, without = errors(law, friction)
+    assert with_it.max() < LENGTH
+    assert without.max() > 5e-3
+
+
+def test_looking_from_where_a_row_settles_makes_it_jump(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So the secant of the last two looks is what brings it to rest."""
+    monkeypatch.setattr(conditions, "MOST_BACK", 0.0)
+    with_it, _ = errors(RIPPLES, 0.7)
+    assert with_it.max() > 1e-3
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.7])
+def test_a_flat_face_spans_a_dent_and_lies_on_top_of_a_bump(friction: float) -> None:
+    """Where it touches is between its corners, and the floor is steep beside it."""
+    presses = ((0.03, 0.0, 0.0), (0.03, -0.02, 0.0))
+    spans, _ = errors(DENT, friction, presses, SLAB)
+    on_top, without = errors(BUMP, friction, presses, SLAB)
+    assert max(spans.max(), on_top.max()) < LENGTH
+    assert without.min() > 2.9e-3
 
 
 def test_friction_by_place_is_a_field_of_friction() -> None:

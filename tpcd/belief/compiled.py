@@ -61,6 +61,9 @@ def compiled_filter(
                 conditions.compliance,
             )
         ),
+        (conditions.warp if conditions.warps else conditions.warp[:, :, :0])
+        .mT.contiguous()
+        .numpy(),
         settings.substeps,
         settings.finest,
         settings.largest_turn,

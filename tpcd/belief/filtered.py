@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -51,6 +52,19 @@ class HistoryLikelihood:
         """Of some particles, without how their transitions settled."""
         values = {name: v[index] for name, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **values, steps=None)
+
+
+def joined(parts: Sequence[HistoryLikelihood]) -> HistoryLikelihood:
+    """What is said of some particles after another, all asked the same."""
+    whole = {}
+    for name, first in vars(parts[0]).items():
+        values = [getattr(part, name) for part in parts]
+        if isinstance(first, Steps):
+            ways = zip(*(vars(value).values() for value in values), strict=True)
+            whole[name] = Steps(*(torch.cat(way) for way in ways))
+        else:
+            whole[name] = None if first is None else torch.cat(values)
+    return HistoryLikelihood(**whole)
 
 
 def filter_history(

@@ -95,6 +95,7 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
         given.follow_path,
     )
     normals, offsets, friction, compliance = new_planes(terrains)
+    here = World(np.zeros((1, 2, count)), normals, offsets, friction, compliance)
     law = own_law(law)
     for i in which[first:last]:
         found.total[i] = -np.inf
@@ -115,7 +116,7 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
             starts[k, 2] += begins
             previous[k, 2] += begins
             commands[k, 2] += ends
-        here = World(points[i : i + 1], normals, offsets, friction, compliance)
+        _hold(here, points, given, i, 0)
         _meet(here, given, i, 0)
         extent = prepare(here, 0, law, request, 0, steps, chains)
         begin(state, measured, seen, measured.sd[i])
@@ -134,6 +135,9 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
             for t in range(terrains):
                 state.gap_before[t] = state.gap[t]
             explained, stopped, first_term = False, False, 0.0
+            if given.warp.shape[3] > 0:
+                _hold(here, points, given, i, k + 1)
+                extent = prepare(here, 0, law, request, k, k + 1, chains)
             for again in range(PASSES):
                 _meet(here, given, i, k + 1)
                 for t in range(terrains):
@@ -151,9 +155,7 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
                 if again == 0 and math.isfinite(term):
                     explained, first_term = is_explained(state, measured), term
                     far = expect_gap(state, measured, k) > measured.far
-                    stopped = not explained and _stop(
-                        points[i], here, answer, measured, seen, k, ends, state
-                    )
+                    stopped = not explained and _stop(here, answer, measured, seen, k, ends, state)
                     if not far and not stopped:
                         break
                 elif again == 1 and (
@@ -199,6 +201,21 @@ def _turns(given, i, k):
 
 @inner
 @no_type_check
+def _hold(here, points, given, i, row):
+    """Take over the outline of a particle as it is at a row."""
+    for a in range(2):
+        for j in range(points.shape[2]):
+            here.points[0, a, j] = points[i, a, j]
+    if given.warp.shape[3] > 0:
+        p = i if given.warp.shape[0] > 1 else 0
+        r = row if given.warp.shape[1] > 1 else 0
+        for a in range(2):
+            for j in range(points.shape[2]):
+                here.points[0, a, j] += given.warp[p, r, a, j]
+
+
+@inner
+@no_type_check
 def _meet(here, given, i, row):
     """Take over the planes of a particle at a row."""
     each, rows = given.offsets.shape[0] > 1, given.offsets.shape[1] > 1
@@ -212,7 +229,7 @@ def _meet(here, given, i, row):
 
 @inner
 @no_type_check
-def _stop(outline, here, answer, measured, seen, k, ends, state):
+def _stop(here, answer, measured, seen, k, ends, state):
     """Let terrains that were not touched, but before which the object was held back, be touched at
     the pose that was read; whether there are any."""
     found = False
@@ -228,8 +245,9 @@ def _stop(outline, here, answer, measured, seen, k, ends, state):
             continue
         along, across = u * c + v * s, v * c - u * s
         nearest = np.inf
-        for p in range(outline.shape[1]):
-            nearest = min(nearest, along * outline[0, p] + across * outline[1, p])
+        for p in range(here.points.shape[2]):
+            height = along * here.points[0, 0, p] + across * here.points[0, 1, p]
+            nearest = min(nearest, height)
         nearest += u * x + v * z - here.offsets[0, t] - state.gap_before[t]
         if nearest > -state.gap[t]:
             state.gap[t] = -nearest

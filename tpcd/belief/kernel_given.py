@@ -38,7 +38,7 @@ class Given(NamedTuple):
 
     `commands` and `stiffness` (.., .., 3); `turns` (.., .., 1) the angle of the object in the
     hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` and
-    `compliance` (.., .., t).
+    `compliance` (.., .., t). `warp` (.., .., 2, p) moves the outline of a row, p = 0 where none is.
     """
 
     commands: np.ndarray
@@ -48,6 +48,7 @@ class Given(NamedTuple):
     offsets: np.ndarray
     friction: np.ndarray
     compliance: np.ndarray
+    warp: np.ndarray
     substeps: int
     finest: float
     largest_turn: float

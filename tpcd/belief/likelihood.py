@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tpcd.belief.compiled import compiled_filter
-from tpcd.belief.filtered import HistoryLikelihood, Steps, filter_history
+from tpcd.belief.filtered import HistoryLikelihood, Steps, filter_history, joined
 from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
@@ -35,10 +35,15 @@ from tpcd.belief.setting import Setting, merge
 from tpcd.contact import ContactScene, scene_from_parameters
 from tpcd.effects.conditions import Outcome
 from tpcd.effects.protocol import Added
+from tpcd.effects.simulate import outcome_in_parts
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings, native
 from tpcd.simulator.step import needs_gradient
+
+AT_ONCE = 64
+"""Particles of an uneven floor that are evaluated together: each row of each has an outline of its
+own, more of which than the processor's cache holds take longer."""
 
 
 def history_likelihood(
@@ -76,6 +81,15 @@ def history_likelihood(
             )
             return _spread(part, index, len(hopeless))
     inputs = (parameters.to_vector(), misfit_sd)
+    if added is not None and added.parts > 1 and len(misfit_sd) > 1.5 * AT_ONCE:
+        given = (least, added, outcome)
+        found = []
+        for index in torch.arange(len(misfit_sd)).split(AT_ONCE):
+            bounds, effects, answered = (one if one is None else one[index] for one in given)
+            some = (Parameters.from_vector(inputs[0][index]), misfit_sd[index], history, field)
+            options = (settings, bounds, innovations, effects, answered, steps)
+            found.append(history_likelihood(shape, *some, *options))
+        return joined(found)
     compiled = misfit_sd.device.type == "cpu" and native.available() and not needs_gradient(*inputs)
     points = native.outlines(shape, parameters) if compiled else None
     scene = scene_from_parameters(shape, parameters, points)
@@ -117,6 +131,10 @@ def effective_setting(
     one that is given, or else that of as many passes as they need."""
     base = history.setting(scene)
     passes = added.passes if outcome is None else 0
+    if outcome is None:
+        moves = torch.nonzero(~history.seams).flatten() + 1
+        parts = (scene, base.conditions, history.rows, moves, added, settings)
+        outcome = outcome_in_parts(*parts)
     for k in range(passes):
         # What a row is loaded with counts for the next one, also where its transition does not.
         setting = replace(_answering(base, history, added, outcome), used=~history.seams)
@@ -126,7 +144,8 @@ def effective_setting(
         else:
             found = filter_history(*arguments, steps=True)
         assert found.steps is not None
-        outcome = outcome_of(found.steps, history, setting.used, first=k == 0)
+        now = outcome_of(found.steps, history, setting.used, scene.points_ee, first=k == 0)
+        outcome = now.after(outcome)
     return _answering(base, history, added, outcome), outcome
 
 
@@ -137,7 +156,11 @@ def _answering(base: Setting, history: History, added: Added, outcome: Outcome |
 
 
 def outcome_of(
-    steps: Steps, history: History, used: Bool[Tensor, " n"], first: bool = False
+    steps: Steps,
+    history: History,
+    used: Bool[Tensor, " n"],
+    points_ee: Float[Tensor, "m p 2"],
+    first: bool = False,
 ) -> Outcome:
     """The settled rows: those of the transitions in use, and readings where none leads to a row."""
     m = len(steps.pose)
@@ -148,8 +171,7 @@ def outcome_of(
         torch.cat((value.new_zeros(m, 1, *value.shape[2:]), value), dim=1)
         for value in (steps.mode, steps.contacts.nan_to_num(0.0))
     )
-    whether = torch.full(pose.shape[:2], first, device=pose.device)
-    return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:], whether)
+    return Outcome.of(pose, mode, contacts, points_ee, first)
 
 
 def highest_terms(history: History) -> Float[Tensor, " n"]:

@@ -129,7 +129,7 @@ def innovations(
         scene.points_ee, setting, sd, question.misfit, fit.step, innovations=True, steps=True
     )
     assert found.whitened is not None and found.steps is not None
-    outcome = outcome_of(found.steps, history, setting.used)
+    outcome = outcome_of(found.steps, history, setting.used, scene.points_ee)
     return found.whitened, outcome[:1], weights
 
 

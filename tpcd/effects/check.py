@@ -98,7 +98,10 @@ def _made_up() -> tuple[Rows, Conditions, Outcome]:
     mode = torch.tensor([[0, 0], [stick, 0], [slip, 0], [0, stick]])
     arm = torch.zeros(_ROWS, 2, 2, dtype=torch.float64)
     arm[:, 0, 1], arm[:, 1, 0] = -0.05, 0.05
-    first = torch.ones(_ROWS, dtype=torch.bool)
-    parts = (poses, mode, load, -0.4 * load, arm * (load > 0)[..., None], first)
-    outcome = Outcome(*(part.expand(_PARTICLES, *part.shape).clone() for part in parts))
+    arm = arm * (load > 0)[..., None]
+    outline = torch.tensor([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]]).double()
+    contacts = torch.cat((load[..., None], -0.4 * load[..., None], arm), dim=-1)
+    parts = (poses, mode, contacts, outline)
+    settled = (part.expand(_PARTICLES, *part.shape).clone() for part in parts)
+    outcome = Outcome.of(*settled, first=True)
     return sequence(poses), conditions, outcome

@@ -19,6 +19,8 @@ from tpcd.terrain import HalfPlane, floor, wall
 
 FLOOR, WALL = 0, 1
 """Positions of the terrains."""
+MOST_BACK = 0.8
+"""Share of a row's last move that the next look at it may go back."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,44 @@ class Outcome:
     """From the end effector to the contact point, in world axes [m]."""
     first: Bool[Tensor, "m r"]
     """Whether effects had no outcome to answer to when the row settled so."""
+    outline: Float[Tensor, "m p 2"]
+    """Points of the object in the end-effector frame [m], with no turn in the hand."""
+    view: Float[Tensor, "m r 3"]
+    """Pose from which effects should look at terrains that are bent [m, m, rad]: near to the
+    settled one, but not so that what is seen from there makes the next one fall back."""
+    missed: Float[Tensor, "m r"]
+    """How far along x the row settled from where it was looked at from [m]; NaN if from nowhere."""
+
+    @classmethod
+    def of(
+        cls,
+        pose: Float[Tensor, "m r 3"],
+        mode: Int[Tensor, "m r t"],
+        contacts: Float[Tensor, "m r t 4"],
+        outline: Float[Tensor, "m p 2"],
+        first: bool = False,
+    ) -> Outcome:
+        """From how rows settle, with `contacts` as in `Transition`."""
+        load, drag, arm = contacts[..., 0], contacts[..., 1], contacts[..., 2:]
+        missed = torch.full_like(pose[..., 0], torch.nan)
+        return cls(pose, mode, load, drag, arm, missed.isnan() & first, outline, pose, missed)
+
+    def between(self, before: Outcome) -> Outcome:
+        """The same, to be looked at from half the way that the rows have come since `before`."""
+        return replace(self, view=before.pose + 0.5 * angle_difference(self.pose, before.pose))
+
+    def after(self, before: Outcome | None) -> Outcome:
+        """The same, to be looked at from where rows that are looked at from there should settle.
+
+        Where the floor is bent so much that looking from where a row settles would make it jump to
+        and fro, that is by the secant of the last two misses (Anderson 1965, of depth one).
+        """
+        if before is None:
+            return self
+        missed = self.pose[..., 0] - before.view[..., 0]
+        share = (missed / (missed - before.missed)).nan_to_num(0.0, 0.0, 0.0).clamp(0.0, MOST_BACK)
+        back = share[..., None] * angle_difference(before.pose, self.pose)
+        return replace(self, view=self.pose + back, missed=missed)
 
     @property
     def place(self) -> Float[Tensor, "m r t 2"]:
@@ -94,6 +134,9 @@ class Conditions:
     """Matrix by which the true wrench is read."""
     bias: Float[Tensor, "#m #r 3"]
     """Added to the wrench that is read [N, N, N·m]."""
+    warp: Float[Tensor, "#m #r #p 2"]
+    """What outline points are moved by, in the end-effector frame [m]: where a terrain is bent, the
+    points are as high over its plane as the true ones are over the terrain."""
 
     @property
     def target(self) -> Float[Tensor, "#m #r 3"]:
@@ -115,6 +158,11 @@ class Conditions:
         """Offsets of the planes as seen from ground that is carried [m]."""
         return self.offset - (self.normal * self.carried[:, :, None, :2]).sum(-1)
 
+    @property
+    def warps(self) -> bool:
+        """Whether any point of an outline may be moved."""
+        return self.warp.shape[2] > 1
+
     def scene(self, points_ee: Float[Tensor, "m 1 p 2"]) -> ContactScene:
         """Outlines and planes as a scene of batch (m, r), or (m, 1) where rows are alike."""
         offset = self.offset_seen
@@ -123,12 +171,12 @@ class Conditions:
             offset.shape,
             self.friction.shape,
             self.compliance.shape,
-            (len(points_ee), 1, 1),
+            (len(points_ee), self.warp.shape[1], 1),
         )
         normals, offsets = self.normal.expand(*each, 2), offset.expand(each)
         planes = zip(normals.unbind(2), offsets.unbind(2), strict=True)
         return ContactScene(
-            points_ee,
+            points_ee + self.warp if self.warps else points_ee,
             tuple(HalfPlane(*plane) for plane in planes),
             self.friction.expand(each),
             self.compliance.expand(each),
@@ -166,6 +214,7 @@ def bare_conditions(commands: Float[Tensor, "r 3"], stiffness: Float[Tensor, " 3
         give=zero,
         sensor=torch.eye(3, dtype=commands.dtype)[None, None],
         bias=zero,
+        warp=zero[..., None, :2],
     )
 
 

@@ -26,6 +26,8 @@ class DeclaredEffect:
     text: str
     needs: tuple[str, ...] = ()
     passes: int = 0
+    parts: int = 1
+    """Parts into which the first pass is cut: more where how a row settles depends on its way."""
     source: str = ""
     """File that it was read from; empty for the catalogue."""
 

@@ -7,7 +7,6 @@ people to find out.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -16,13 +15,12 @@ from torch import Tensor
 
 from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows, angle_difference
 from tpcd.effects.declare import DeclaredEffect, column
-from tpcd.effects.geometry import on_curve, sunk, with_plane
+from tpcd.effects.geometry import sunk
 from tpcd.effects.protocol import EffectParameter
+from tpcd.effects.uneven import RELIEFS
 
 Covariate = Callable[[Outcome, Rows], Tensor]
 """From the outcome to one number for each particle, row and terrain (m, r, t)."""
-_RAMP = 0.0025
-"""Half width of the ramp at a step of the floor [m]."""
 
 
 def _place(outcome: Outcome, rows: Rows) -> Tensor:
@@ -59,27 +57,6 @@ def _log_friction(covariate: Covariate):
     return change
 
 
-def _step(
-    conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
-) -> Conditions:
-    if outcome is None:
-        return conditions
-    height, at = column(values, 0), column(values, 1)
-    rise = 0.5 * (1.0 + ((outcome.place[:, :, FLOOR, 0] - at) / _RAMP).tanh())
-    return with_plane(conditions, FLOOR, offset=conditions.offset[:, :, FLOOR] + height * rise)
-
-
-def _wave(
-    conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
-) -> Conditions:
-    if outcome is None:
-        return conditions
-    sine, cosine, length = (column(values, i) for i in range(3))
-    x, number = outcome.place[:, :, FLOOR, 0], 2 * math.pi / length
-    s, c = (number * x).sin(), (number * x).cos()
-    return on_curve(conditions, x, sine * s + cosine * c, number * (sine * c - cosine * s))
-
-
 def _stiffening(
     conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
 ) -> Conditions:
@@ -113,31 +90,7 @@ FORMULAS = (
     _friction_formula("angle", "1/rad", 5.0, _angle),
     _friction_formula("time", "1", 2.0, _time),
     _friction_formula("slip", "1/m", 20.0, _slip),
-    DeclaredEffect(
-        "floor_height ~ step",
-        "geometry",
-        (
-            EffectParameter("height", "m", -0.01, 0.01, shown_unit="mm", shown_factor=1e3),
-            EffectParameter("place", "m", -0.1, 0.2, null=0.05, shown_unit="mm", shown_factor=1e3),
-        ),
-        _step,
-        "the floor is higher by {0} beyond x = {1}",
-        needs=("floor places",),
-        passes=1,
-    ),
-    DeclaredEffect(
-        "floor_height ~ wave",
-        "geometry",
-        (
-            EffectParameter("sine", "m", -0.005, 0.005, shown_unit="mm", shown_factor=1e3),
-            EffectParameter("cosine", "m", -0.005, 0.005, shown_unit="mm", shown_factor=1e3),
-            EffectParameter("length", "m", 0.03, 0.15, 0.06, shown_unit="mm", shown_factor=1e3),
-        ),
-        _wave,
-        "the floor rises by {0} sin(2πx / l) and {1} cos(2πx / l), with l = {2}",
-        needs=("floor places",),
-        passes=2,
-    ),
+    *RELIEFS,
     DeclaredEffect(
         "floor_height ~ root of load",
         "contact normal",

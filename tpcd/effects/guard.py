@@ -20,8 +20,9 @@ FIELDS = tuple(field.name for field in fields(Conditions))
 _LEAST_DETERMINANT = 1e-9
 
 
-def malformed(before: Conditions, after: object, particles: int, rows: int) -> str:
-    """What is wrong with the form of conditions that an effect returned; empty if nothing is."""
+def malformed(before: Conditions, after: object, particles: int, rows: int, points: int) -> str:
+    """What is wrong with the form of conditions that an effect returned, for outlines of so many
+    points; empty if nothing is."""
     if not isinstance(after, Conditions):
         return f"returns {type(after).__name__}, expected the conditions"
     for name in changed(before, after):
@@ -29,7 +30,7 @@ def malformed(before: Conditions, after: object, particles: int, rows: int) -> s
         if not isinstance(value, Tensor) or value.dtype != old.dtype:
             found = value.dtype if isinstance(value, Tensor) else type(value).__name__
             return f"returns {name} as {found}, expected {old.dtype}"
-        rest = tuple(old.shape[2:])
+        rest = (points, 2) if name == "warp" else tuple(old.shape[2:])
         lead = value.ndim == old.ndim and value.shape[0] in (1, particles)
         if not lead or value.shape[1] not in (1, rows) or tuple(value.shape[2:]) != rest:
             ending = "".join(f", {size}" for size in rest)

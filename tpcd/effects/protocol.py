@@ -124,6 +124,11 @@ class Added:
         passes = [effect.passes for effect in self.effects if effect.passes]
         return max(passes, default=0) + (len(passes) > 1)
 
+    @property
+    def parts(self) -> int:
+        """Into how many parts the first pass is cut, which goes on from where each part ends."""
+        return max((getattr(effect, "parts", 1) for effect in self.effects), default=1)
+
     def apply(self, conditions: Conditions, rows: Rows, outcome: Outcome | None) -> Conditions:
         """The conditions with all effects, site by site.
 
@@ -169,7 +174,8 @@ def _tried(
     except Exception as error:
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         raise EffectError(effect.name, f"fails with {cause[:300]}", source) from error
-    problem = malformed(before, after, len(values), len(rows.share))
+    points = before.warp.shape[2] if outcome is None else outcome.outline.shape[1]
+    problem = malformed(before, after, len(values), len(rows.share), points)
     if problem:
         raise EffectError(effect.name, problem, source)
     return after

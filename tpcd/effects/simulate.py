@@ -9,7 +9,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.contact import ContactScene
-from tpcd.effects.conditions import Conditions, Outcome, Rows, base_conditions, sequence
+from tpcd.effects.conditions import (
+    Conditions,
+    Outcome,
+    Rows,
+    angle_difference,
+    base_conditions,
+    sequence,
+)
 from tpcd.effects.protocol import Added
 from tpcd.simulator import StepSettings, Transition, simulate_step
 
@@ -49,13 +56,37 @@ def simulate_rows(
     rests = (rows.starts != commands).any(-1)
     rests = rests if rests.ndim == 1 else rests.any(0)
     index, loaded = (torch.nonzero(which).flatten() for which in (follows, follows | rests))
-    outcome = None
+    outcome = outcome_in_parts(scene, base, rows, loaded, added, settings, gap)
     for k in range(added.passes if passes is None else passes):
         conditions = added.apply(base, rows, outcome)
         transition = _settle(scene, conditions, rows, loaded, settings, gap)
-        outcome = _outcome(transition, rows, loaded, first=k == 0)
+        outcome = _outcome(scene, transition, rows, loaded, first=k == 0).after(outcome)
     conditions = added.apply(base, rows, outcome)
     return _read(_settle(scene, conditions, rows, index, settings, gap), conditions, index)
+
+
+def outcome_in_parts(
+    scene: ContactScene,
+    base: Conditions,
+    rows: Rows,
+    index: Int[Tensor, " n"],
+    added: Added,
+    settings: StepSettings,
+    gap: Float[Tensor, "m r t"] | None = None,
+) -> Outcome | None:
+    """How the rows at `index` settle where effects ask for a way in parts, each of which answers to
+    where the one before ended; None where they do not."""
+    if added.parts < 2:
+        return None
+    outcome = _at_rest(scene, rows)
+    rough, here = replace(settings, finest=1.0), None
+    for part in range(added.parts):
+        conditions = added.apply(base, rows, outcome)
+        span = part / added.parts, (part + 1) / added.parts
+        transition = _settle(scene, conditions, rows, index, rough, gap, span, here)
+        here = transition.pose - _moved(conditions, index)
+        outcome = _outcome(scene, transition, rows, index, first=part == 0).between(outcome)
+    return outcome
 
 
 class RowByRow:
@@ -81,14 +112,9 @@ class RowByRow:
         self._base = base_conditions(scene, commands, stiffness)
         self._rows = sequence(start.expand(len(commands), 3))
         self._first = added.apply(self._base, self._rows, None)
-        m, terrains = len(scene.friction), scene.friction.shape[-1]
-        contact = start.new_zeros(m, len(commands), terrains)
-        self._past = Outcome(
-            start.expand(m, len(commands), 3), contact.long(), contact, contact,
-            torch.stack((contact, contact), dim=-1), contact[..., 0] > 0,
-        )  # fmt: skip
+        self._past = _at_rest(scene, self._rows)
         if added.passes:
-            self.settle(0, start.expand(m, 3))
+            self.settle(0, start.expand(len(scene.friction), 3))
 
     def settle(self, row: int, start: Float[Tensor, "m 3"]) -> SimulatedRows:
         """Settle the next row from the poses [m, m, rad] where the one before ended."""
@@ -97,13 +123,17 @@ class RowByRow:
         starts = torch.where(here[:, None], start[:, None], self._past.pose)
         rows = replace(self._rows, starts=starts)
         conditions = self._first
+        now = outcome_in_parts(
+            self._scene, self._base, rows, index, self._added, self._settings, self._gap
+        )
+        if now is not None:
+            seen = _with_row(self._past, now, here)
+            conditions = self._added.apply(self._base, rows, seen)
         for left in range(self._added.passes, -1, -1):
             transition = _settle(self._scene, conditions, rows, index, self._settings, self._gap)
-            now = _outcome(transition, rows, index, first=left == self._added.passes)
-            parts = zip(vars(now).items(), vars(self._past).values(), strict=True)
-            seen = Outcome(
-                **{name: torch.where(_along(here, new), new, old) for (name, new), old in parts}
-            )
+            first = left == self._added.passes
+            now = _outcome(self._scene, transition, rows, index, first).after(now)
+            seen = _with_row(self._past, now, here)
             if left:
                 conditions = self._added.apply(self._base, rows, seen)
         self._past = seen
@@ -136,7 +166,10 @@ def _settle(
     index: Tensor,
     settings: StepSettings,
     gap: Tensor | None,
+    span: tuple[float, float] = (0.0, 1.0),
+    begin: Tensor | None = None,
 ) -> Transition:
+    """Settle rows after a part of their way, from where they start or from `begin`."""
     here = conditions.scene(scene.points_ee[:, None])
     if here.batch_shape[1] > 1:
         here = here.columns(index)
@@ -149,13 +182,42 @@ def _settle(
         _at(target - conditions.carried, index) + _at(turn, index),
         _at(target, before) + _at(turn, before),
     )
+    if begin is not None:
+        starts = begin
+    if span != (0.0, 1.0):
+        first, way = previous, angle_difference(commands, previous)
+        previous, commands = (first + share * way for share in span)
     stiffness = _at(conditions.stiffness, index)
     transition = simulate_step(here, starts, commands, stiffness, settings, previous=previous)
-    moved = _at(conditions.give, index) - _at(turn, index)
-    return replace(transition, pose=transition.pose + moved)
+    return replace(transition, pose=transition.pose + _moved(conditions, index))
 
 
-def _outcome(transition: Transition, rows: Rows, index: Tensor, first: bool) -> Outcome:
+def _moved(conditions: Conditions, index: Tensor) -> Tensor:
+    """From the pose of the object as seen from the ground to that of the end effector."""
+    return _at(conditions.give, index) - _at(_pose(conditions.turn), index)
+
+
+def _at_rest(scene: ContactScene, rows: Rows) -> Outcome:
+    """All rows where they start, without contact."""
+    m, terrains = scene.friction.shape
+    pose = rows.starts.expand(m, -1, -1)
+    contacts = pose.new_zeros(m, pose.shape[1], terrains, 4)
+    return Outcome.of(pose, contacts[..., 0].long(), contacts, scene.points_ee.expand(m, -1, -1))
+
+
+def _with_row(past: Outcome, now: Outcome, here: Tensor) -> Outcome:
+    """An outcome with the rows `here` of another one."""
+    both = zip(vars(now).items(), vars(past).values(), strict=True)
+    rows = {
+        name: new if name == "outline" else torch.where(_along(here, new), new, old)
+        for (name, new), old in both
+    }
+    return Outcome(**rows)
+
+
+def _outcome(
+    scene: ContactScene, transition: Transition, rows: Rows, index: Tensor, first: bool
+) -> Outcome:
     m, terrains = len(transition.pose), transition.mode.shape[-1]
     starts = rows.starts.expand(m, -1, -1)
     pose = starts.clone()
@@ -166,8 +228,7 @@ def _outcome(transition: Transition, rows: Rows, index: Tensor, first: bool) -> 
     mode[:, index] = transition.mode
     contacts = pose.new_zeros(m, len(rows.share), terrains, 4)
     contacts[:, index] = transition.contacts.nan_to_num(0.0)
-    whether = torch.full(pose.shape[:2], first, device=pose.device)
-    return Outcome(pose, mode, contacts[..., 0], contacts[..., 1], contacts[..., 2:], whether)
+    return Outcome.of(pose, mode, contacts, scene.points_ee.expand(m, -1, -1), first)
 
 
 def _along(rows: Tensor, value: Tensor) -> Tensor:

@@ -1,0 +1,140 @@
+"""Floors that are not straight within the width of an object: steps, waves and bumps.
+
+The step knows one plane of the floor for each row. It is laid tangent to the floor where the
+outline comes nearest to it, and every outline point is moved up or down such that it is as high
+over that plane as it truly is over the floor. So an object rests on all that it touches, at the
+pose that the floor is looked at from; that is where the row settled in the pass before. What
+two points touch has one direction, that of the nearest one. Where an object comes to rest can
+depend on what lies on its way, which is therefore gone in parts at first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows
+from tpcd.effects.declare import DeclaredEffect, column
+from tpcd.effects.geometry import with_plane
+from tpcd.effects.protocol import EffectParameter
+from tpcd.planar import rotate
+
+Relief = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From parameters (m, p) and places x (m, r, q) [m] along the floor to heights over its plane [m]
+and their slopes there."""
+NEAR = 0.02
+"""Points that are further from the floor than this [m] only have to stay away from it."""
+_RAMP = 0.0025
+"""Half width of the ramp at a step of the floor [m]."""
+_PARTS, _PASSES = 4, 3
+
+
+def on_uneven(
+    conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome, relief: Relief
+) -> Conditions:
+    """The conditions over a floor with a relief over its plane, as seen from where the rows are
+    looked at. Rows that follow no other stay as they are."""
+    angle = outcome.view[..., 2:] + conditions.turn
+    x, z = (rotate(angle, outcome.outline[:, None]) + outcome.view[..., None, :2]).unbind(-1)
+    normal, offset = conditions.normal[:, :, FLOOR], conditions.offset[:, :, FLOOR, None]
+    rise, slope = relief(values, x)
+    first = (rows.follows == torch.arange(len(rows.follows), device=x.device))[:, None]
+    flat = first | ((rise == 0) & (slope == 0)).all(-1, keepdim=True)
+    across, along = normal[..., :1], normal[..., 1:]
+    floor = (offset - across * x) / along + rise
+    slope = slope - across / along
+    gap = z - floor
+    nearest = (gap * (1 + slope**2).rsqrt()).argmin(-1, keepdim=True)
+    at_x, at_z, steep = (value.gather(-1, nearest) for value in (x, floor, slope))
+    above = z - (at_z + steep * (x - at_x))
+    up = torch.where(gap < NEAR, gap, above.clamp_min(NEAR)) - above
+    up = torch.where(flat, 0.0, up)
+    warp = conditions.warp
+    if bool(up.any()):
+        warp = warp + up[..., None] * torch.stack((angle.sin(), angle.cos()), dim=-1)
+    length = (1 + steep**2).sqrt()
+    tangent = torch.cat((-steep, torch.ones_like(steep)), dim=-1) / length
+    tangent = torch.where(flat, normal, tangent)
+    through = torch.where(flat, offset, (at_z - steep * at_x) / length)
+    return with_plane(replace(conditions, warp=warp), FLOOR, tangent, through[..., 0])
+
+
+def _step(values: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    height, place = (column(values, i)[..., None] for i in range(2))
+    ramp = ((x - place) / _RAMP).tanh()
+    return height * (0.5 * (1.0 + ramp)), height * (0.5 / _RAMP) * (1.0 - ramp**2)
+
+
+def _wave(values: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    sine, cosine, length = (column(values, i)[..., None] for i in range(3))
+    number = 2 * math.pi / length
+    s, c = (number * x).sin(), (number * x).cos()
+    return sine * s + cosine * c, number * (sine * c - cosine * s)
+
+
+def _bump(values: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    height, place, width = (column(values, i)[..., None] for i in range(3))
+    away = (x - place) / width
+    rise = height * (-0.5 * away**2).exp()
+    return rise, -rise * away / width
+
+
+def _relief_formula(
+    name: str, relief: Relief, parameters: tuple[EffectParameter, ...], text: str
+) -> DeclaredEffect:
+    def change(
+        conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome | None
+    ) -> Conditions:
+        if outcome is None:
+            return conditions
+        return on_uneven(conditions, values, rows, outcome, relief)
+
+    return DeclaredEffect(
+        f"floor_height ~ {name}",
+        "geometry",
+        parameters,
+        change,
+        text,
+        needs=("floor places",),
+        passes=_PASSES,
+        parts=_PARTS,
+    )
+
+
+def _millimetres(name: str, low: float, high: float, null: float = 0.0) -> EffectParameter:
+    return EffectParameter(name, "m", low, high, null, shown_unit="mm", shown_factor=1e3)
+
+
+RELIEFS = (
+    _relief_formula(
+        "step",
+        _step,
+        (_millimetres("height", -0.01, 0.01), _millimetres("place", -0.1, 0.2, 0.05)),
+        "the floor is higher by {0} beyond x = {1}",
+    ),
+    _relief_formula(
+        "wave",
+        _wave,
+        (
+            _millimetres("sine", -0.005, 0.005),
+            _millimetres("cosine", -0.005, 0.005),
+            _millimetres("length", 0.03, 0.15, 0.06),
+        ),
+        "the floor rises by {0} sin(2πx / l) and {1} cos(2πx / l), with l = {2}",
+    ),
+    _relief_formula(
+        "bump",
+        _bump,
+        (
+            _millimetres("height", -0.01, 0.01),
+            _millimetres("place", -0.1, 0.2, 0.05),
+            _millimetres("width", 0.005, 0.05, 0.015),
+        ),
+        "the floor rises by {0} about x = {1}, over a width (sd) of {2}",
+    ),
+)
+"""Formulas of an uneven floor."""

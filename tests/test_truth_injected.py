@@ -24,6 +24,7 @@ from injected_parts import (
 )
 
 from tpcd.truth.injected import InjectedMujocoTruth
+from tpcd.truth.injected_world import FloorShape
 from tpcd.truth.mujoco_truth import MujocoTruth
 from tpcd.truth.protocol import Truth
 
@@ -167,26 +168,37 @@ def test_a_step_in_the_floor_lifts_what_passes_it():
     assert np.allclose(heights, [0.0, 0.002, 0.0], atol=LENGTH)
 
 
-def test_a_rippled_floor_lifts_by_its_waves():
+@pytest.mark.parametrize("skew", [0.0, 0.25])
+def test_a_rippled_floor_lifts_by_its_waves(skew: float):
     rows = follow(
-        {"floor_ripple": {"height": 0.001, "length": 0.08}},
+        {"floor_ripple": {"height": 0.001, "length": 0.08, "skew": skew}},
         (0.02, 0.03, 0), (0.06, 0.03, 0), (-0.02, 0.03, 0), vertices=WEDGE, friction=0.2,
     )  # fmt: skip
     x, heights = np.array([lowest(WEDGE, row) for row in rows]).T
+    wave = 2 * np.pi * x / 0.08
     assert np.ptp(heights) > 0.0015
-    assert np.allclose(heights, 0.001 * np.sin(2 * np.pi * x / 0.08), atol=5 * LENGTH)
+    assert np.allclose(heights, 0.001 * (np.sin(wave) + skew * np.sin(2 * wave)), atol=5 * LENGTH)
 
 
+@pytest.mark.parametrize("skew", [0.0, 0.4])
 @pytest.mark.parametrize("height", [0.002, -0.002])
-def test_a_bump_lifts_what_passes_it_and_a_dent_lets_it_sink(height: float):
+def test_a_bump_lifts_what_passes_it_and_a_dent_lets_it_sink(height: float, skew: float):
     rows = follow(
-        {"floor_bump": {"height": height, "x": 0.02}},
+        {"floor_bump": {"height": height, "x": 0.02, "skew": skew}},
         (0, 0.03, 0), (0.02, 0.03, 0), (0.06, 0.03, 0), (0.03, 0.03, 0),
         vertices=WEDGE, friction=0.2,
     )  # fmt: skip
     x, heights = np.array([lowest(WEDGE, row) for row in rows]).T
-    assert np.ptp(heights) > 0.0015
-    assert np.allclose(heights, height * np.exp(-0.5 * ((x - 0.02) / 0.012) ** 2), atol=5 * LENGTH)
+    width = 0.012 * np.where(x > 0.02, 1 + skew, 1 - skew)
+    assert np.ptp(heights) > 0.001
+    assert np.allclose(heights, height * np.exp(-0.5 * ((x - 0.02) / width) ** 2), atol=5 * LENGTH)
+
+
+def test_the_rise_of_a_floor_is_the_slope_of_its_height():
+    shape = FloorShape(0.02, 0.5, 2e-3, 0.01, 1e-3, 0.07, 0.25, 3e-3, 0.03, 0.4)
+    x = np.linspace(-0.05, 0.1, 311)
+    slope = (shape.height(x + 1e-7) - shape.height(x - 1e-7)) / 2e-7
+    assert np.allclose(np.tan(shape.rise(x)), slope, atol=3e-5)
 
 
 def slide_ratios(hidden, depth=0.05, **scene) -> list[float]:

@@ -45,21 +45,23 @@ MEDIUM: Sizes = {
 OUTSIDE: Sizes = {
     "floor_step": {"height": 3e-3, "x": 0.05},
     "friction_field": {"slope": 6.0},
-    "floor_ripple": {"height": 1.5e-3, "length": 0.06},
-    "floor_bump": {"height": 3e-3, "x": 0.05},
+    "floor_ripple": {"height": 1.5e-3, "length": 0.06, "skew": 0.25},
+    "floor_bump": {"height": 3e-3, "x": 0.05, "skew": 0.4},
 }
-"""Effects that the catalogue does not have, the last not even a formula; MuJoCo alone can be given
-them."""
+"""Effects that the catalogue does not have, and of which no formula has quite the form; MuJoCo
+alone can be given them."""
 PLACES = frozenset(
     {
         ("payload", "lever"),
         ("floor_step", "x"),
         ("floor_ripple", "length"),
+        ("floor_ripple", "skew"),
         ("floor_bump", "x"),
+        ("floor_bump", "skew"),
         ("grasp_slip", "at"),
     }
 )
-"""Parameters that say where or when: the same for small effects."""
+"""Parameters that say where, when or of which form: the same for small effects."""
 RANGES = {("grasp_slip", "at"): (0.3, 0.7)}
 """Parameters that are drawn from a range instead of around a size."""
 SMALL = 0.35

@@ -40,7 +40,8 @@ STEP_LENGTH = 0.005
 LARGEST_TURN = 0.35
 """Angle from upright up to which the object can meet a bulging floor [rad]."""
 BUMP_WIDTH = 0.012
-"""Standard deviation of the bump in the floor, which has the form of a normal density [m]."""
+"""Standard deviation of the bump in the floor, which has the form of a normal density [m], wider by
+its skew on the right and narrower on the left."""
 BOX = 1.0
 """Half the side of the boxes [m]."""
 
@@ -59,10 +60,14 @@ class FloorShape:
     """Amplitude of a wave along the floor [m]."""
     ripple_length: float = 1.0
     """Length of the wave [m]."""
+    ripple_skew: float = 0.0
+    """Share of a second wave, half as long."""
     bump_height: float = 0.0
     """Of a single bump, a dent where negative [m]."""
     bump_x: float = 0.0
     """Where it is highest [m]."""
+    bump_skew: float = 0.0
+    """Share by which it is wider to the right than in the mean, and narrower to the left."""
 
     @property
     def is_flat(self) -> bool:
@@ -83,7 +88,8 @@ class FloorShape:
         """Height [m] at x [m]."""
         share = np.clip((x - self.step_x) / STEP_LENGTH, 0.0, 1.0)
         step = self.step_height * share**2 * (3.0 - 2.0 * share)
-        ripple = self.ripple_height * np.sin(self.ripple_number * x)
+        wave = self.ripple_number * x
+        ripple = self.ripple_height * (np.sin(wave) + self.ripple_skew * np.sin(2 * wave))
         return self.slope * x + self.curvature * x**2 / 2 + step + ripple + self._bump(x)
 
     def rise(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -91,12 +97,16 @@ class FloorShape:
         share = np.clip((x - self.step_x) / STEP_LENGTH, 0.0, 1.0)
         step = self.step_height * 6.0 * share * (1.0 - share) / STEP_LENGTH
         number = self.ripple_number
-        ripple = self.ripple_height * number * np.cos(number * x)
-        bump = -(x - self.bump_x) / BUMP_WIDTH**2 * self._bump(x)
+        wave = np.cos(number * x) + 2 * self.ripple_skew * np.cos(2 * number * x)
+        ripple = self.ripple_height * number * wave
+        bump = -(x - self.bump_x) / self._bump_width(x) ** 2 * self._bump(x)
         return np.arctan(self.slope + self.curvature * x + step + ripple + bump)
 
     def _bump(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        return self.bump_height * np.exp(-0.5 * ((x - self.bump_x) / BUMP_WIDTH) ** 2)
+        return self.bump_height * np.exp(-0.5 * ((x - self.bump_x) / self._bump_width(x)) ** 2)
+
+    def _bump_width(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        return BUMP_WIDTH * (1.0 + self.bump_skew * np.sign(x - self.bump_x))
 
 
 def floor_shape(effects: ActiveEffects) -> FloorShape:
@@ -108,8 +118,10 @@ def floor_shape(effects: ActiveEffects) -> FloorShape:
         effects.get("floor_step", "x"),
         effects.get("floor_ripple", "height"),
         effects.get("floor_ripple", "length") or 1.0,
+        effects.get("floor_ripple", "skew"),
         effects.get("floor_bump", "height"),
         effects.get("floor_bump", "x"),
+        effects.get("floor_bump", "skew"),
     )
 
 
@@ -128,8 +140,8 @@ def floor_points(
     if shape.is_smooth and shape.curvature >= 0.0:
         return hull
     bend = abs(shape.curvature) + 6.0 * abs(shape.step_height) / STEP_LENGTH**2
-    bend += abs(shape.ripple_height) * shape.ripple_number**2
-    bend += abs(shape.bump_height) / BUMP_WIDTH**2
+    bend += abs(shape.ripple_height) * shape.ripple_number**2 * (1.0 + 4.0 * abs(shape.ripple_skew))
+    bend += abs(shape.bump_height) / (BUMP_WIDTH * (1.0 - abs(shape.bump_skew))) ** 2
     spacing = min(max(math.sqrt(8.0 * 5e-6 / bend), 1e-3), 4e-3)
     points = []
     for first, second in zip(outline_ee, np.roll(outline_ee, -1, axis=0), strict=True):
@@ -138,7 +150,8 @@ def floor_points(
     candidates = np.concatenate((hull, *points))
     span = float(np.ptp(hull, axis=0).max())
     bulge = abs(shape.curvature) * span**2 / 2 + abs(shape.step_height) + 1e-4
-    bulge += 2.0 * abs(shape.ripple_height) + abs(shape.bump_height)
+    bulge += 2.0 * abs(shape.ripple_height) * (1.0 + abs(shape.ripple_skew))
+    bulge += abs(shape.bump_height)
     turns = angle + np.linspace(-LARGEST_TURN, LARGEST_TURN, 41)
     heights = candidates @ np.array([np.sin(turns), np.cos(turns)])
     near = (heights - heights.min(axis=0) < bulge).any(axis=1)

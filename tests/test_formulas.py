@@ -10,6 +10,9 @@ import torch
 from injected_parts import FORCE, LENGTH, SLAB, WEDGE, follow, lowest, make_scene, vector
 
 from tpcd.effects import conditions
+from tpcd.effects.catalogue import find_effect
+from tpcd.effects.check import check_effect
+from tpcd.effects.formula import formulas_over
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.truth.injected_world import STEP_LENGTH
 
@@ -134,3 +137,11 @@ def test_a_step_is_a_step() -> None:
     ours = modelled(formula, 0.2)
     assert np.allclose(ours[:, :2], true[:, :2], atol=5 * LENGTH)
     assert np.ptp(true[:, 1]) > 0.0015
+
+
+def test_formulas_look_for_places_where_the_floor_was_touched() -> None:
+    (step,) = (f for f in formulas_over(0.4, 0.7) if f.name == "floor_height ~ step")
+    height, place = step.parameters
+    assert (place.low, place.high, place.null) == pytest.approx((0.4, 0.7, 0.55))
+    assert height == find_effect(step.name).parameters[0]
+    check_effect(step)

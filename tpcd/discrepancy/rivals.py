@@ -34,7 +34,6 @@ from tpcd.discrepancy.workbench import (
     looked_closer,
     takes_the_place,
 )
-from tpcd.effects.formula import FORMULAS
 from tpcd.effects.protocol import Effect
 
 FULL_FITS = 2
@@ -115,7 +114,7 @@ def _questions(
 ) -> Iterator[tuple[Fit, list[Effect], tuple[Effect, ...]]]:
     """Models without some effects, the formulas that may stand for those, and these effects."""
     own = current.effects[bench.given :]
-    others = [f for f in FORMULAS if f.name not in current.names]
+    others = [f for f in bench.formulas if f.name not in current.names]
     sites = dict.fromkeys(effect.site for effect in own)
     together = [tuple(effect for effect in own if effect.site == site) for site in sites]
     parts = [(effect,) for effect in own] + together

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from tpcd.belief.belief import misfit_field
-from tpcd.belief.history import joined_history
+from tpcd.belief.history import History, joined_history
 from tpcd.belief.prior import make_prior
 from tpcd.belief.settings import EstimatorSettings
 from tpcd.data.episode import Episode
@@ -32,11 +32,14 @@ from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import FEWEST_ROWS, DiagnosisSettings
 from tpcd.discrepancy.variants import FINER, Variant, step_halving
 from tpcd.discrepancy.workbench import Close, Workbench, fit_well
-from tpcd.effects.formula import FORMULAS
+from tpcd.effects.formula import formulas_over
 from tpcd.effects.protocol import Effect
 from tpcd.shape.protocol import Shape
 
 __all__ = ["DiagnosisSettings", "diagnose"]
+
+BESIDE = 0.06
+"""How far beside the hand the floor may be touched [m]."""
 
 
 def diagnose(
@@ -57,7 +60,8 @@ def diagnose(
     started = time.perf_counter()
     settings = settings or DiagnosisSettings()
     question = _question(episodes, shape, settings, memory or Memory())
-    bench = Workbench(question, settings, coverage_of(episodes), len(effects), tell)
+    coverage, formulas = coverage_of(episodes), _formulas_for(question.history)
+    bench = Workbench(question, settings, coverage, len(effects), tell, formulas)
     stop = _preflight(bench, episodes)
     if stop:
         tell(f"verdict: not enough information: {stop}")
@@ -88,6 +92,12 @@ def _question(
         settings.seed,
         memory,
     )
+
+
+def _formulas_for(history: History) -> tuple[Effect, ...]:
+    """The formulas, which look for places along the floor where the object has been."""
+    x = history.poses[:, 0]
+    return formulas_over(float(x.min()) - BESIDE, float(x.max()) + BESIDE)
 
 
 def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
@@ -130,7 +140,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
     outdone_asked: set[tuple[str, ...]] = set()
     exchanges = Exchanges()
     gone: set[str] = set()  # added, and then not needed: it would be added again
-    stages = [settings.catalogue, FORMULAS]
+    stages = [settings.catalogue, bench.formulas]
     stage = 0
     while stage < len(stages):
         pool = [effect for effect in stages[stage] if effect.name not in gone]
@@ -173,7 +183,11 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
                 break
         explained = _explains(bench, current)
         found_some = len(current.effects) > bench.given
-        if found_some and stages[stage] is not FORMULAS and current.names not in outdone_asked:
+        if (
+            found_some
+            and stages[stage] is not bench.formulas
+            and current.names not in outdone_asked
+        ):
             outdone_asked.add(current.names)
             rival = outdone(bench, base, current, explained)
             near = rival.close if rival.best else (*close, *rival.close)

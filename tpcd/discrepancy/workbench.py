@@ -27,7 +27,7 @@ from tpcd.discrepancy.settings import (
     VETO_LEVEL,
     DiagnosisSettings,
 )
-from tpcd.effects.formula import FORMULA_NAMES
+from tpcd.effects.formula import FORMULA_NAMES, FORMULAS
 from tpcd.effects.protocol import Effect
 from tpcd.errors import FileError
 from tpcd.random import stream
@@ -45,6 +45,8 @@ class Workbench:
     given: int
     """Effects that are part of the model to begin with."""
     tell: Callable[[str], None]
+    formulas: Sequence[Effect] = FORMULAS
+    """What is tried where the catalogue does not suffice, and in place of what it found."""
     candidates: list[Candidate] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     glances: list[Glance] = field(default_factory=list)

@@ -103,3 +103,19 @@ FORMULAS = (
 )
 """Formulas that are tried, in no order."""
 FORMULA_NAMES = frozenset(formula.name for formula in FORMULAS)
+
+
+def formulas_over(low: float, high: float) -> tuple[DeclaredEffect, ...]:
+    """The formulas for a floor that was touched from `low` to `high` [m], where they look for
+    places."""
+    middle = 0.5 * (low + high)
+
+    def there(parameter: EffectParameter) -> EffectParameter:
+        if parameter.name != "place":
+            return parameter
+        return replace(parameter, low=low, high=high, null=middle)
+
+    return tuple(
+        replace(formula, parameters=tuple(there(parameter) for parameter in formula.parameters))
+        for formula in FORMULAS
+    )

@@ -110,7 +110,7 @@ def test_looking_from_where_a_row_settles_makes_it_jump(monkeypatch: pytest.Monk
     assert with_it.max() > 1e-3
 
 
-@pytest.mark.parametrize("friction", [0.2, 0.7])
+@pytest.mark.parametrize("friction", [0.7, 1.0])
 def test_a_flat_face_spans_a_dent_and_lies_on_top_of_a_bump(friction: float) -> None:
     """Where it touches is between its corners, and the floor is steep beside it."""
     presses = ((0.03, 0.0, 0.0), (0.03, -0.02, 0.0))

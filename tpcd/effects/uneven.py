@@ -30,7 +30,7 @@ NEAR = 0.02
 """Points that are further from the floor than this [m] only have to stay away from it."""
 _RAMP = 0.0025
 """Half width of the ramp at a step of the floor [m]."""
-_PARTS, _PASSES = 4, 3
+_PARTS, _PASSES = 2, 2
 
 
 def on_uneven(

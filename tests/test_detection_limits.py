@@ -23,7 +23,7 @@ EXCITED = Coverage(dict.fromkeys(NEEDED, 1e6))
 
 def glance_of(name: str, sd: tuple[float, ...]) -> Glance:
     """A look at an effect whose parameters have these standard deviations."""
-    return Glance(0.0, sd, torch.zeros(1), torch.eye(1), find_effect(name))
+    return Glance(0.0, sd, torch.zeros(1), torch.eye(1), torch.zeros(0, 1), find_effect(name))
 
 
 def log_mean_likelihood(parameter: EffectParameter, size: float, sd: float) -> float:

@@ -33,7 +33,7 @@ def worth(monkeypatch: pytest.MonkeyPatch) -> None:
 def looks_of(worth: dict[str, float]) -> list[Glance]:
     """Looks that find such log evidences, or 60."""
     one = torch.eye(1)
-    return [Glance(worth.get(e.name, 60.0), (1.0,), one[0], one, e) for e in CATALOGUE]
+    return [Glance(worth.get(e.name, 60.0), (1.0,), one[0], one, one[:0], e) for e in CATALOGUE]
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_where_something_is_left_and_nothing_promises_a_gain_all_have_a_quick_fi
     begun: list[tuple[str, ...]] = []
     tried: list[str] = []
 
-    def quickly(question: Question, effects, seeds, start, passes: int) -> Fit:
+    def quickly(question: Question, effects, seeds, start, places, passes: int) -> Fit:
         tried.append(effects[-1].name)
         assert passes == 1 and question.sampler.draws == promises.QUICK["draws"]
         found = 109.0 if effects[-1] is CATALOGUE[1] else 99.0

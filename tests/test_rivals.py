@@ -126,7 +126,7 @@ class Stand:
 
     def look(self, question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
         found = self.looks.get((*base.names, effect.name), 30.0)
-        return Glance(found, (0.1,), torch.zeros(9), torch.eye(9), effect)
+        return Glance(found, (0.1,), torch.zeros(9), torch.eye(9), torch.zeros(0, 9), effect)
 
     def left(self, fit: Fit) -> Adequacy:
         return Adequacy(0.01, 0.5, 0.5, ()) if self.adequate else Adequacy(0.3, 1e-9, 0.5, ())

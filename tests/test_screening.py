@@ -38,3 +38,31 @@ def test_points_go_on_while_any_of_them_rises(
     assert seen[0] == (screening.PLACES, ROUNDS)
     assert seen[1:] == [(GOING_ON, ROUNDS)] * often
     assert torch.isfinite(found.place).all()
+
+
+def test_what_says_where_it_is_is_sought_all_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bump begins small, everywhere along the floor and of any width; the best places are offered
+    to a full fit, which an effect that is everywhere does not need."""
+    question = question_of(in_free_space(0.3))
+    base = fit_model(question, (), (0,))
+    begun: list[Climbers] = []
+
+    def climb(target: ContactTarget, points: Climbers, rounds: int) -> Climbers:
+        begun.append(points)
+        return points
+
+    monkeypatch.setattr(screening, "climb", climb)
+    bump = find_effect("floor_height ~ bump")
+    found = glance(question, base, bump, 0)
+    prior = question.scene.with_effects((bump,))
+    assert len(begun[0].points) == screening.SCATTERED
+    height, place, width = prior.to_vector(begun[0].points[:, :-1])[:, -3:].T
+    for value, parameter in ((place, bump.parameters[1]), (width, bump.parameters[2])):
+        share = (value.sort().values - parameter.low) / (parameter.high - parameter.low)
+        expected = (torch.arange(len(value)) + 0.5) / len(value)
+        torch.testing.assert_close(share, expected.double(), rtol=0, atol=0.5 / len(value))
+    assert height.abs().max() < 0.2 * bump.parameters[0].high
+    assert torch.corrcoef(torch.stack((place, width)))[0, 1].abs() < 0.2
+    assert [len(points.points) for points in begun[:5]] == [288, 144, 72, 36, 18]
+    assert found.places.shape == (1 + screening.OFFERED, question.scene.dimension + 4)
+    assert len(glance(question, base, find_effect("force_gain"), 0).places) == 1

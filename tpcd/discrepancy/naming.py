@@ -92,7 +92,7 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
     ranked = sorted(glances, key=lambda g: -gains[g.effect.name])[: settings.full_fits]
     chosen = [g for g in ranked if gains[g.effect.name] > PROMISING[adequate]]
     astray = not adequate and current.worth < FEW_DRAWS
-    places = {g.effect.name: g.place[None] for g in glances}
+    places = {g.effect.name: g.places for g in glances}
 
     def fitted(effect: Effect) -> Fit:
         effects, found = (*current.effects, effect), places[effect.name]

@@ -76,10 +76,12 @@ def quick_fits(
     reach of looks, whose points climb alone, and draws that learn from each other find it."""
     sampler = replace(bench.question.sampler, **QUICK)
     question = replace(bench.question, sampler=sampler)
+    places = {g.effect.name: g.others for g in glances}
 
     def fitted(effect: Effect) -> Fit:
-        effects = (*current.effects, effect)
-        return fit_model(question, effects, (QUICK_SEED,), start=(current,), passes=1)
+        effects, others = (*current.effects, effect), places[effect.name]
+        start = (current,)
+        return fit_model(question, effects, (QUICK_SEED,), start=start, places=others, passes=1)
 
     fits = each_of(bench, [g.effect for g in glances], number, fitted)
     return {fit.names[-1]: fit for fit in fits}

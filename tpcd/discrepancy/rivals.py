@@ -153,7 +153,7 @@ def _looked_at(
 def _fit_of(bench: Workbench, current: Fit, rival: _Rival):
     def fitted(formula: Effect) -> tuple[_Rival, Fit]:
         effects, start = (*rival.without.effects, formula), (rival.without, current)
-        places = rival.seen.place[None]
+        places = rival.seen.places
         return rival, fit_model(bench.question, effects, (0, 1), start=start, places=places)
 
     return fitted

@@ -9,22 +9,31 @@ to gain.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.modes import climb, set_out
+from tpcd.belief.modes import Climbers, climb, set_out
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
 from tpcd.discrepancy.fit import Fit, Question, fit_stream
-from tpcd.effects.protocol import Effect, effect_parameters
+from tpcd.effects.protocol import Effect, EffectParameter, effect_parameters
 
 PLACES = 16
 """Places of the base fit from which points climb, for an effect of one parameter."""
 MOST_PLACES = 48
+SCATTERED = 288
+"""Places from which points climb where an effect says where it is: all over that, and small,"""
+ELSEWHERE = 4
+"""each fourth in a scene from the prior: without the effect, the model may have gone astray."""
+OFFERED = 16
+"""Of these, places from which a full fit sets out."""
+SMALL = 0.2
+"""Standard scores within which the others begin about their null values."""
 ROUNDS = 4
 FURTHER = 3
 """Times at most that so many rounds more are climbed"""
@@ -50,6 +59,13 @@ class Peak:
     """The mode, in unconstrained coordinates,"""
     information: Float[Tensor, "s s"]
     """and the curvature there."""
+    others: Float[Tensor, "k s"]
+    """Other places that a full fit should set out from: where an effect says where it is."""
+
+    @property
+    def places(self) -> Float[Tensor, "k s"]:
+        """From which a full fit sets out."""
+        return torch.cat((self.place[None], self.others))
 
 
 @dataclass(frozen=True)
@@ -80,12 +96,7 @@ def _climbed(question: Question, base: Fit, prior: ParameterPrior, new: int, fre
     """Where points arrive under a prior whose last `new` parameters the base fit has not."""
     target = ContactTarget(prior, question.misfit, base.step, question.history)
     generator = fit_stream(question, prior.effects, 0)
-    # Two parameters, such as how high a step is and where, are rarely right by chance together.
-    count = min(PLACES * max(new, 1) ** 2, MOST_PLACES)
-    start = set_out(target, carried(base, prior, generator, count, repeat=count > PLACES))
-    if count > PLACES:
-        begun = climb(target, start, FRESH_ROUNDS)
-        start = begun[begun.height.topk(PLACES).indices]
+    start = _begun(target, base, new, generator)
     if fresh:
         begun = set_out(target, target.scatter(fresh, generator))
         begun = climb(target, begun, FRESH_ROUNDS)
@@ -105,4 +116,56 @@ def _climbed(question: Question, base: Fit, prior: ParameterPrior, new: int, fre
     vector, slope = prior.to_vector_with_slope(best.points[top][:-1])
     sd = covariance.diagonal()[:-1].sqrt() * slope
     own = sd[len(vector) - new :]
-    return Peak(float(each[top]), tuple(own.tolist()), best.points[top], information[top])
+    others = start.points[start.height.topk(min(OFFERED, len(start.height))).indices]
+    if not _says_where(prior, new):
+        others = others[:0]
+    return Peak(float(each[top]), tuple(own.tolist()), best.points[top], information[top], others)
+
+
+def _says_where(prior: ParameterPrior, new: int) -> bool:
+    """Whether any of the last `new` parameters says where an effect is."""
+    return new > 0 and any(one.where for one in effect_parameters(prior.effects)[-new:])
+
+
+def _begun(target: ContactTarget, base: Fit, new: int, generator: torch.Generator) -> Climbers:
+    """Points from where the base model arrived that have begun to climb with `new` parameters."""
+    prior = target.prior
+    if _says_where(prior, new):
+        own = effect_parameters(prior.effects)[-new:]
+        begins = carried(base, prior, generator, SCATTERED, repeat=True)
+        astray = target.scatter(SCATTERED // ELSEWHERE, generator)
+        begins[::ELSEWHERE, : -new - 1] = astray[:, : -new - 1]
+        start = set_out(target, _all_over(begins, own, prior, generator))
+        while len(start.height) > PLACES:
+            start = climb(target, start, ROUNDS)
+            start = start[start.height.topk(max(PLACES, len(start.height) // 2)).indices]
+        return start
+    # Two parameters, such as the weight of a payload and its lever, are rarely right together.
+    count = min(PLACES * max(new, 1) ** 2, MOST_PLACES)
+    start = set_out(target, carried(base, prior, generator, count, repeat=count > PLACES))
+    if count > PLACES:
+        begun = climb(target, start, FRESH_ROUNDS)
+        start = begun[begun.height.topk(PLACES).indices]
+    return start
+
+
+def _all_over(
+    points: Float[Tensor, "k s"],
+    own: Sequence[EffectParameter],
+    prior: ParameterPrior,
+    generator: torch.Generator,
+) -> Float[Tensor, "k s"]:
+    """Points of which what says where an effect is lies all over its range, in equal shares, and
+    the other parameters of the effect nearly vanish."""
+    k, first = len(points), points.shape[-1] - 1 - len(own)
+    null = torch.cat((prior.low[:first], torch.tensor([p.null for p in own], dtype=torch.float64)))
+    null_score = prior.to_score(null)
+    points = points.clone()
+    for i, parameter in enumerate(own, start=first):
+        drawn = torch.rand(k, generator=generator, dtype=torch.float64)
+        if parameter.where:
+            order = torch.randperm(k, generator=generator)
+            points[:, i] = torch.special.ndtri((order + drawn) / k)
+        else:
+            points[:, i] = null_score[i] + SMALL * (2.0 * drawn - 1.0)
+    return points

@@ -54,6 +54,9 @@ class EffectParameter:
     """Unit in which people read it; empty for the SI unit."""
     shown_factor: float = 1.0
     """What the SI value is multiplied by to be shown."""
+    where: bool = False
+    """Whether it says where or how wide: the effect is absent at the null values of the others, and
+    shows only where this one is about right, which a search has to try all over its range."""
 
     def __post_init__(self) -> None:
         """Refuse a prior without width."""

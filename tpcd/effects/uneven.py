@@ -105,8 +105,9 @@ def _relief_formula(
     )
 
 
-def _millimetres(name: str, low: float, high: float, null: float = 0.0) -> EffectParameter:
-    return EffectParameter(name, "m", low, high, null, shown_unit="mm", shown_factor=1e3)
+def _millimetres(name: str, low: float, high: float, null: float | None = None) -> EffectParameter:
+    where = null is not None
+    return EffectParameter(name, "m", low, high, null or 0.0, "mm", 1e3, where)
 
 
 RELIEFS = (

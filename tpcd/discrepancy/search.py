@@ -183,11 +183,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
                 break
         explained = _explains(bench, current)
         found_some = len(current.effects) > bench.given
-        if (
-            found_some
-            and stages[stage] is not bench.formulas
-            and current.names not in outdone_asked
-        ):
+        if found_some and stage == 0 and current.names not in outdone_asked:
             outdone_asked.add(current.names)
             rival = outdone(bench, base, current, explained)
             near = rival.close if rival.best else (*close, *rival.close)

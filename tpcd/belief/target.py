@@ -12,12 +12,13 @@ from torch import Tensor
 from tpcd.belief.filtered import HistoryLikelihood
 from tpcd.belief.flattening import Flattening, flattening
 from tpcd.belief.history import History
-from tpcd.belief.likelihood import history_likelihood
+from tpcd.belief.likelihood import AT_ONCE, history_likelihood
 from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.setting import merge
 from tpcd.effects.conditions import Outcome
+from tpcd.effects.protocol import parts_of
 from tpcd.simulator import ContactMode, StepSettings, native
 
 _LARGE_MISFIT = 2.0
@@ -83,6 +84,10 @@ class ContactTarget:
 
         Entries that cannot be evaluated count as flat.
         """
+        if parts_of(self.prior.effects) > 1 and len(score) > 1.5 * AT_ONCE:
+            some = [self.curvature(part) for part in score.split(AT_ONCE)]
+            rise, information = (torch.cat(part) for part in zip(*some, strict=True))
+            return rise, information
         found = self._linearised(score)
         here = torch.nan_to_num(found.whitened).flatten(1)
         slopes = torch.nan_to_num(found.slopes, 0.0, 0.0, 0.0).flatten(2)

@@ -129,8 +129,8 @@ class Added:
 
     @property
     def parts(self) -> int:
-        """Into how many parts the first pass is cut, which goes on from where each part ends."""
-        return max((getattr(effect, "parts", 1) for effect in self.effects), default=1)
+        """Those of its effects, as in `parts_of`."""
+        return parts_of(self.effects)
 
     def apply(self, conditions: Conditions, rows: Rows, outcome: Outcome | None) -> Conditions:
         """The conditions with all effects, site by site.
@@ -211,6 +211,11 @@ def _check_some_answer(
             " (a stiffness above 0, a compliance of at least 0)",
             getattr(effect, "source", ""),
         )
+
+
+def parts_of(effects: Sequence[Effect]) -> int:
+    """Into how many parts the first pass is cut, which goes on from where each part ends."""
+    return max((getattr(effect, "parts", 1) for effect in effects), default=1)
 
 
 def effect_to_plain(effect: Effect) -> dict[str, Any]:

@@ -124,7 +124,7 @@ class Stand:
 
         return again(current), [again(fit) for fit in near]
 
-    def look(self, question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
+    def look(self, question: Question, base: Fit, effect: Effect, fresh: int, *_) -> Glance:
         found = self.looks.get((*base.names, effect.name), 30.0)
         return Glance(found, (0.1,), torch.zeros(9), torch.eye(9), torch.zeros(0, 9), effect)
 

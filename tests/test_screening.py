@@ -55,7 +55,6 @@ def test_what_says_where_it_is_is_sought_all_over(monkeypatch: pytest.MonkeyPatc
     bump = find_effect("floor_height ~ bump")
     found = glance(question, base, bump, 0)
     prior = question.scene.with_effects((bump,))
-    assert len(begun[0].points) == screening.SCATTERED
     height, place, width = prior.to_vector(begun[0].points[:, :-1])[:, -3:].T
     for value, parameter in ((place, bump.parameters[1]), (width, bump.parameters[2])):
         share = (value.sort().values - parameter.low) / (parameter.high - parameter.low)
@@ -66,3 +65,6 @@ def test_what_says_where_it_is_is_sought_all_over(monkeypatch: pytest.MonkeyPatc
     assert [len(points.points) for points in begun[:5]] == [288, 144, 72, 36, 18]
     assert found.places.shape == (1 + screening.OFFERED, question.scene.dimension + 4)
     assert len(glance(question, base, find_effect("force_gain"), 0).places) == 1
+    begun.clear()
+    glance(question, base, bump, 0, explained=True)
+    assert [len(points.points) for points in begun[:3]] == [72, 36, 18]

@@ -99,7 +99,7 @@ def _chosen(bench: Workbench, base: Fit, current: Fit, explained: bool) -> list[
     """The rivals that are worth a full fit, each formula in the one place where it does best."""
     best: dict[str, _Rival] = {}
     for without, formulas, instead_of in _questions(bench, base, current, explained):
-        for rival in _looked_at(bench, without, formulas, instead_of):
+        for rival in _looked_at(bench, without, formulas, instead_of, explained):
             known = best.get(rival.formula.name)
             if known is None or rival.worth > known.worth:
                 best[rival.formula.name] = rival
@@ -139,11 +139,19 @@ def _questions(
 
 
 def _looked_at(
-    bench: Workbench, without: Fit, formulas: Sequence[Effect], instead_of: tuple[Effect, ...]
+    bench: Workbench,
+    without: Fit,
+    formulas: Sequence[Effect],
+    instead_of: tuple[Effect, ...],
+    explained: bool,
 ) -> list[_Rival]:
     fresh = FRESH[False] if bench.settings.from_prior else 0
     number = len(without.effects) - bench.given + 1
-    seen = each_of(bench, formulas, number, lambda f: glance(bench.question, without, f, fresh))
+
+    def look(formula: Effect) -> Glance:
+        return glance(bench.question, without, formula, fresh, explained)
+
+    seen = each_of(bench, formulas, number, look)
     return [
         _Rival(one, without, instead_of, bench.price((one.effect,)) - bench.price(instead_of))
         for one in seen

@@ -26,8 +26,9 @@ from tpcd.effects.protocol import Effect, EffectParameter, effect_parameters
 PLACES = 16
 """Places of the base fit from which points climb, for an effect of one parameter."""
 MOST_PLACES = 48
-SCATTERED = 288
-"""Places from which points climb where an effect says where it is: all over that, and small,"""
+SCATTERED = {True: 72, False: 288}
+"""Places from which points climb where an effect says where it is: all over that, and small; fewer
+where another model explains the data,"""
 ELSEWHERE = 4
 """each fourth in a scene from the prior: without the effect, the model may have gone astray."""
 OFFERED = 16
@@ -75,28 +76,48 @@ class Glance(Peak):
     effect: Effect
 
 
-def glance(question: Question, base: Fit, effect: Effect, fresh: int) -> Glance:
+def glance(
+    question: Question, base: Fit, effect: Effect, fresh: int, explained: bool = False
+) -> Glance:
     """Climb to the modes of the base model's effects and one more; `fresh` points set out from
-    all over the prior."""
-    found = peak(question, base, (effect,), fresh)
+    all over the prior. Less is done where the data are `explained` by another model."""
+    found = peak(question, base, (effect,), fresh, explained)
     return Glance(**vars(found), effect=effect)
 
 
-def peak(question: Question, base: Fit, more: tuple[Effect, ...], fresh: int) -> Peak:
+def peak(
+    question: Question, base: Fit, more: tuple[Effect, ...], fresh: int, explained: bool = False
+) -> Peak:
     """The same for one effect more, or for the model as it is."""
     effects = (*base.effects, *more)
     names = tuple(e.name for e in effects)
     prior = question.scene.with_effects(effects)
-    key = ("peak", question.fingerprint, names, prior.low, prior.high, base.fingerprint, fresh)
     new = len(effect_parameters(more))
-    return question.memory.recall(key, Peak, lambda: _climbed(question, base, prior, new, fresh))
+    key: tuple = (
+        "peak",
+        question.fingerprint,
+        names,
+        prior.low,
+        prior.high,
+        base.fingerprint,
+        fresh,
+    )
+    scattered = SCATTERED[explained] if _says_where(prior, new) else 0
+    if scattered:
+        key = (*key, scattered)
+    return question.memory.recall(
+        key, Peak, lambda: _climbed(question, base, prior, new, fresh, scattered)
+    )
 
 
-def _climbed(question: Question, base: Fit, prior: ParameterPrior, new: int, fresh: int) -> Peak:
-    """Where points arrive under a prior whose last `new` parameters the base fit has not."""
+def _climbed(
+    question: Question, base: Fit, prior: ParameterPrior, new: int, fresh: int, scattered: int
+) -> Peak:
+    """Where points arrive under a prior whose last `new` parameters the base fit has not; so many
+    are `scattered` over where an effect may be."""
     target = ContactTarget(prior, question.misfit, base.step, question.history)
     generator = fit_stream(question, prior.effects, 0)
-    start = _begun(target, base, new, generator)
+    start = _begun(target, base, new, generator, scattered)
     if fresh:
         begun = set_out(target, target.scatter(fresh, generator))
         begun = climb(target, begun, FRESH_ROUNDS)
@@ -117,7 +138,7 @@ def _climbed(question: Question, base: Fit, prior: ParameterPrior, new: int, fre
     sd = covariance.diagonal()[:-1].sqrt() * slope
     own = sd[len(vector) - new :]
     others = start.points[start.height.topk(min(OFFERED, len(start.height))).indices]
-    if not _says_where(prior, new):
+    if not scattered:
         others = others[:0]
     return Peak(float(each[top]), tuple(own.tolist()), best.points[top], information[top], others)
 
@@ -127,13 +148,15 @@ def _says_where(prior: ParameterPrior, new: int) -> bool:
     return new > 0 and any(one.where for one in effect_parameters(prior.effects)[-new:])
 
 
-def _begun(target: ContactTarget, base: Fit, new: int, generator: torch.Generator) -> Climbers:
+def _begun(
+    target: ContactTarget, base: Fit, new: int, generator: torch.Generator, scattered: int
+) -> Climbers:
     """Points from where the base model arrived that have begun to climb with `new` parameters."""
     prior = target.prior
-    if _says_where(prior, new):
+    if scattered:
         own = effect_parameters(prior.effects)[-new:]
-        begins = carried(base, prior, generator, SCATTERED, repeat=True)
-        astray = target.scatter(SCATTERED // ELSEWHERE, generator)
+        begins = carried(base, prior, generator, scattered, repeat=True)
+        astray = target.scatter(scattered // ELSEWHERE, generator)
         begins[::ELSEWHERE, : -new - 1] = astray[:, : -new - 1]
         start = set_out(target, _all_over(begins, own, prior, generator))
         while len(start.height) > PLACES:

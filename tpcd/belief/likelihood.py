@@ -20,6 +20,7 @@ to the same without effects.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -34,7 +35,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import Setting, merge
 from tpcd.contact import ContactScene, scene_from_parameters
 from tpcd.effects.conditions import Outcome
-from tpcd.effects.protocol import Added
+from tpcd.effects.protocol import Added, Effect, parts_of
 from tpcd.effects.simulate import outcome_in_parts
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
@@ -44,6 +45,11 @@ from tpcd.simulator.step import needs_gradient
 AT_ONCE = 64
 """Particles of an uneven floor that are evaluated together: each row of each has an outline of its
 own, more of which than the processor's cache holds take longer."""
+
+
+def in_groups(effects: Sequence[Effect], count: int) -> bool:
+    """Whether so many particles with these effects are evaluated `AT_ONCE` by `AT_ONCE`."""
+    return parts_of(effects) > 1 and count > 1.5 * AT_ONCE
 
 
 def history_likelihood(
@@ -81,7 +87,7 @@ def history_likelihood(
             )
             return _spread(part, index, len(hopeless))
     inputs = (parameters.to_vector(), misfit_sd)
-    if added is not None and added.parts > 1 and len(misfit_sd) > 1.5 * AT_ONCE:
+    if added is not None and in_groups(added.effects, len(misfit_sd)):
         given = (least, added, outcome)
         found = []
         for index in torch.arange(len(misfit_sd)).split(AT_ONCE):
@@ -133,8 +139,7 @@ def effective_setting(
     passes = added.passes if outcome is None else 0
     if outcome is None:
         moves = torch.nonzero(~history.seams).flatten() + 1
-        parts = (scene, base.conditions, history.rows, moves, added, settings)
-        outcome = outcome_in_parts(*parts)
+        outcome = outcome_in_parts(scene, base.conditions, history.rows, moves, added, settings)
     for k in range(passes):
         # What a row is loaded with counts for the next one, also where its transition does not.
         setting = replace(_answering(base, history, added, outcome), used=~history.seams)

@@ -12,13 +12,12 @@ from torch import Tensor
 from tpcd.belief.filtered import HistoryLikelihood
 from tpcd.belief.flattening import Flattening, flattening
 from tpcd.belief.history import History
-from tpcd.belief.likelihood import AT_ONCE, history_likelihood
+from tpcd.belief.likelihood import AT_ONCE, history_likelihood, in_groups
 from tpcd.belief.linearised import linearised_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.setting import merge
 from tpcd.effects.conditions import Outcome
-from tpcd.effects.protocol import parts_of
 from tpcd.simulator import ContactMode, StepSettings, native
 
 _LARGE_MISFIT = 2.0
@@ -84,7 +83,7 @@ class ContactTarget:
 
         Entries that cannot be evaluated count as flat.
         """
-        if parts_of(self.prior.effects) > 1 and len(score) > 1.5 * AT_ONCE:
+        if in_groups(self.prior.effects, len(score)):
             some = [self.curvature(part) for part in score.split(AT_ONCE)]
             rise, information = (torch.cat(part) for part in zip(*some, strict=True))
             return rise, information

@@ -93,18 +93,9 @@ def peak(
     names = tuple(e.name for e in effects)
     prior = question.scene.with_effects(effects)
     new = len(effect_parameters(more))
-    key: tuple = (
-        "peak",
-        question.fingerprint,
-        names,
-        prior.low,
-        prior.high,
-        base.fingerprint,
-        fresh,
-    )
     scattered = SCATTERED[explained] if _says_where(prior, new) else 0
-    if scattered:
-        key = (*key, scattered)
+    model = (names, prior.low, prior.high, base.fingerprint, fresh, scattered)
+    key = ("peak", question.fingerprint, *model)
     return question.memory.recall(
         key, Peak, lambda: _climbed(question, base, prior, new, fresh, scattered)
     )

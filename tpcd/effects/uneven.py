@@ -24,20 +24,27 @@ from tpcd.effects.protocol import EffectParameter
 from tpcd.planar import rotate
 
 Relief = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""From parameters (m, p) and places x (m, r, q) [m] along the floor to heights over its plane [m]
-and their slopes there."""
+"""From the k parameters (m, k) of an effect and places x (m, r, p) [m] along the floor to heights
+over its plane (m, r, p) [m] and their slopes there."""
 NEAR = 0.02
 """Points that are further from the floor than this [m] only have to stay away from it."""
 _RAMP = 0.0025
 """Half width of the ramp at a step of the floor [m]."""
 _PARTS, _PASSES = 2, 2
+"""As in `Effect`: more of either leave fewer rows wrong, and take longer (`eval/EVIDENCE.md`)."""
 
 
 def on_uneven(
     conditions: Conditions, values: Tensor, rows: Rows, outcome: Outcome, relief: Relief
 ) -> Conditions:
     """The conditions over a floor with a relief over its plane, as seen from where the rows are
-    looked at. Rows that follow no other stay as they are."""
+    looked at (`Outcome.view`).
+
+    `values` (m, k) are the parameters of the relief. Replaces normal (m, r, 2) and offset (m, r)
+    [m] of the floor, in world axes, by those of its tangent where the outline comes nearest, and
+    adds to `warp` (m, r, p, 2) [m] in the end-effector frame. Rows that follow no other stay as
+    they are.
+    """
     angle = outcome.view[..., 2:] + conditions.turn
     x, z = (rotate(angle, outcome.outline[:, None]) + outcome.view[..., None, :2]).unbind(-1)
     normal, offset = conditions.normal[:, :, FLOOR], conditions.offset[:, :, FLOOR, None]

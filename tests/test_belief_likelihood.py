@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tpcd.belief import likelihood
 from tpcd.belief.belief import estimate
 from tpcd.belief.compiled import compiled_filter
 from tpcd.belief.filtered import HistoryLikelihood, filter_history
@@ -192,6 +193,30 @@ def test_compiled_loops_and_torch_agree_where_outlines_are_warped(
     likely = torch.isfinite(found.total)
     plain = evaluate(shape, particles, history).total
     assert (found.total[likely] - plain[likely]).abs().max() > 1
+
+
+def test_particles_over_an_uneven_floor_are_evaluated_in_groups_to_the_same_bits(
+    shape: PolygonShape, episode: Episode, particles: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history, count = history_of(episode), len(particles)
+    bump = torch.tensor([[1e-3, 0.03, 0.02]], dtype=torch.float64).expand(count, -1)
+    added = Added((find_effect("floor_height ~ bump"),), bump)
+    sd = torch.full((count,), FIELD.sd, dtype=torch.float64)
+    found = []
+    for size in (count, 3):
+        monkeypatch.setattr(likelihood, "AT_ONCE", size)
+        parameters = Parameters.from_vector(particles)
+        arguments = (shape, parameters, sd, history, FIELD, StepSettings())
+        found.append(history_likelihood(*arguments, added=added, innovations=True, steps=True))
+    whole, groups = found
+    assert count > 4 and torch.isfinite(whole.total).any()
+    assert torch.equal(whole.total, groups.total)
+    assert torch.equal(whole.field_covariance, groups.field_covariance)
+    torch.testing.assert_close(whole.whitened, groups.whitened, rtol=0, atol=0, equal_nan=True)
+    pose, same = whole.steps.pose, groups.steps.pose
+    torch.testing.assert_close(pose, same, rtol=0, atol=0, equal_nan=True)
+    plain = evaluate(shape, particles, history).total
+    assert (whole.total - plain).nan_to_num(0.0, 0.0, 0.0).abs().max() > 1
 
 
 @pytest.mark.parametrize("effect", ["floor_compliance", "grasp_compliance", "force_bias"])

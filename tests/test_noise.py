@@ -102,8 +102,16 @@ def test_readings_without_any_scatter_have_the_noise_of_rounding() -> None:
 def test_right_noise_is_not_doubted(seed: int) -> None:
     for steps in (15, 30, 60):
         assert check_noise(episode_of(seed, steps)) == []
-    double, half = (stated(episode_of(seed), f, slice(0, 6)) for f in (1.5, 1 / 1.5))
-    assert check_noise(double) == [] and check_noise(half) == []
+    assert check_noise(stated(episode_of(seed), 1.5, slice(0, 6))) == []
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_noise_that_is_too_small_is_said(seed: int) -> None:
+    """2.5 times too small is said, and of no channel but those at fault."""
+    for channels, names in ((slice(0, 3), {"x", "z", "phi"}), (slice(3, 6), {"F_x", "F_z", "tau"})):
+        told = check_noise(stated(episode_of(seed), 0.4, channels))
+        assert told and all("too small, or the arm creeps or lags" in line for line in told)
+        assert {line.split()[2] for line in told} <= names
 
 
 @pytest.mark.parametrize("seed", SEEDS)

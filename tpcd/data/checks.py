@@ -135,7 +135,8 @@ def _check_start(
             f"{row_name(0, path)}, column {COMMAND_COLUMNS[axis]}: found {command[axis]:.6g},"
             f" expected the start pose {POSE_COLUMNS[axis]} = {pose[axis]:.6g}"
             f" within {allowed[axis]:.2g}",
-            "start free of contact and set command 0 to the measured pose",
+            "start free of contact and set command 0 to the measured pose, or correct sensor_std"
+            f" ({sensor_std[axis]:.2g} here)",
         )
     noise = NOISE_FACTOR * sensor_std[3:] + FREE_WRENCH
     for axis in np.flatnonzero(np.abs(wrench) > noise):
@@ -143,7 +144,8 @@ def _check_start(
             path,
             f"{row_name(0, path)}, column {WRENCH_COLUMNS[axis]}: found {wrench[axis]:.4g} at the"
             f" start pose, expected 0 within {noise[axis]:.2g}",
-            "start free of contact and zero the sensor there",
+            "start free of contact and zero the sensor there, or correct sensor_std"
+            f" ({sensor_std[3 + axis]:.2g} here)",
         )
 
 

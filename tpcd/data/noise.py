@@ -35,8 +35,9 @@ POSES_SHARE = 0.2
 """Noise of a force is read from w - K (x - u) where that of the pose is at most this part of it."""
 SURE, LIKELY = 1e-6, 1e-4
 """Probabilities below which stated noise is refused, or warned of."""
-TOO_LARGE, TOO_SMALL = 1 / 3, 3.0
-"""Scatter over stated noise beyond which it is plainly wrong."""
+TOO_LARGE, TOO_SMALL, FAR_TOO_SMALL = 1 / 3, 2.0, 6.0
+"""Scatter over stated noise at which it is refused as too large, doubted, and refused as too small:
+what the arm does besides may scatter as well."""
 NEAR = 0.2
 """Readings count as near where they would be within so many standard deviations."""
 
@@ -150,7 +151,7 @@ def check_noise(episode: Episode) -> list[str]:
         if stated[k] <= 0 or ratio < TOO_SMALL or p > LIKELY:
             continue
         told = f"sensor_std of {name} is {stated[k]:g}, but {source} by {ratio * stated[k]:.2g}"
-        if source == _PARITY and ratio > 2 * TOO_SMALL and p < SURE:
+        if source == _PARITY and ratio > FAR_TOO_SMALL and p < SURE:
             raise EpisodeError(
                 path, f"{told}: plainly too small", "give what the sensor really scatters by"
             )

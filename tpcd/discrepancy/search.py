@@ -7,6 +7,7 @@ said to be unknown.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -114,14 +115,14 @@ def _preflight(bench: Workbench, episodes: Sequence[Episode]) -> str:
     bench.tests |= {"parity": mean, "parity_p": p}
     bench.tell(
         f"preflight: {rows} transitions, {contact} rows in contact; pose and wrench"
-        f" disagree by {mean:.2f} times their noise (p = {p:.2g})"
+        f" disagree by {math.sqrt(mean):.2f} times their noise (p = {p:.2g})"
     )
     free = free_space_score(episodes)
     if free is not None:
         bench.tests |= {"free_space": free[0], "free_space_p": free[1]}
         bench.tell(
-            f"preflight: in free space poses leave their commands by {free[0]:.2f} times the noise"
-            f" (p = {free[1]:.2g}, {free[2]} rows)"
+            "preflight: in free space poses leave their commands by"
+            f" {math.sqrt(free[0]):.2f} times the noise (p = {free[1]:.2g}, {free[2]} rows)"
         )
     return ""
 

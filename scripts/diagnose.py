@@ -65,6 +65,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         write_diagnosis,
     )
     from tpcd.commands.gap_rows import shown_gaps, shown_share
+    from tpcd.commands.work_line import WorkLine
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.formula import FORMULAS
@@ -93,13 +94,14 @@ def diagnose_episodes(config: Diagnose) -> int:
     with open_diagnosis(config, config.out, config.overwrite, config.resume) as folder:
         if data.answer is not None:
             found = data.answer
-            _tell(f"verdict: not enough information: {found.sentence}")
+            print(f"verdict: not enough information: {found.sentence}")
         else:
             files = (*config.candidates, *(() if config.model is None else (config.model,)))
-            memory = fits_of(folder, files)
-            found = diagnose(
-                data.episodes, shape, settings, data.fresh, model.effects, _tell, memory
-            )
+            with WorkLine() as line:
+                memory = replace(fits_of(folder, files), watch=line.begin)
+                found = diagnose(
+                    data.episodes, shape, settings, data.fresh, model.effects, line.tell, memory
+                )
         found = replace(found, notes=(*data.notes, *found.notes))
         if found.gap:
             print(f"\none-step errors on {found.held_out}, with 90 % intervals")
@@ -118,10 +120,6 @@ def diagnose_episodes(config: Diagnose) -> int:
         )
     print()
     return EXIT_CODES[found.verdict]
-
-
-def _tell(line: str) -> None:
-    print(line, flush=True)
 
 
 if __name__ == "__main__":

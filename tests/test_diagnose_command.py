@@ -113,9 +113,11 @@ def test_a_stopped_run_keeps_its_fits_and_goes_on(
         assert isinstance(memory, Memory) and memory.folder is not None
         told.append(memory)
         if len(told) == 1:
-            memory.recall(("one",), Candidate, lambda: Candidate("a", 1, 2.0))
+            memory.recall("a fit", ("one",), Candidate, lambda: Candidate("a", 1, 2.0))
             raise KeyboardInterrupt
-        assert memory.recall(("one",), Candidate, lambda: Candidate("b", 1, 2.0)).name == "a"
+        assert (
+            memory.recall("a fit", ("one",), Candidate, lambda: Candidate("b", 1, 2.0)).name == "a"
+        )
         return replace(a_diagnosis(), gap=())
 
     monkeypatch.setattr("tpcd.discrepancy.search.diagnose", stopped)

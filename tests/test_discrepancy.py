@@ -170,7 +170,10 @@ def test_an_effect_that_fails_costs_no_other(shape: PolygonShape) -> None:
 def test_a_diagnosis_that_was_stopped_goes_on_with_the_fits_it_had(
     shape: PolygonShape, clean: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = diagnose([clean], shape, SMALL, memory=Memory(tmp_path))
+    begun: list[str] = []
+    whole = diagnose([clean], shape, SMALL, memory=Memory(tmp_path, watch=begun.append))
+    assert {"fit of the base model", "what the base model leaves"} < set(begun)
+    assert {f"look at {effect.name}" for effect in SMALL.catalogue} < set(begun)
     kept = sorted(tmp_path.iterdir())
     assert len(kept) > 4
     for path in kept[::2]:  # as if it had been stopped before these

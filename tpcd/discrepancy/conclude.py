@@ -132,6 +132,7 @@ def _errors(
             return [prediction_errors(*model, fresh) for model in models]
         return [held_out_errors(*model, episodes) for model in models]
 
+    bench.begin("one-step errors")
     return bench.attempt("the gap cannot be told", each)
 
 
@@ -142,6 +143,7 @@ def _alternatives(
     told = []
     for one in found.close:
         names = " and ".join(one.fit.names)
+        bench.begin(f"a motion that tells it from {names}")
         motion = bench.attempt(
             f"no motion that tells it from {names}",
             lambda fit=one.fit: deciding_motion(bench.question, found.final, fit, episodes[0]),

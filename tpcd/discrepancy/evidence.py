@@ -21,7 +21,7 @@ from tpcd.belief.pool import Pool
 from tpcd.belief.settings import SamplerSettings
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
-from tpcd.discrepancy.fit import MISSED, Fit, Question, fit_stream
+from tpcd.discrepancy.fit import MISSED, Fit, Question, fit_stream, model_name
 from tpcd.effects.protocol import Effect
 from tpcd.simulator import StepSettings
 
@@ -66,7 +66,9 @@ def fit_model(
         def work(generator: torch.Generator = generator) -> Cloud:
             return _fitted(target, question.sampler, start, places, generator, passes)
 
-        clouds.append(question.memory.recall((*model, begun, places, seed), Cloud, work))
+        what = f"fit of {model_name(effects)}"
+        key = (*model, begun, places, seed)
+        clouds.append(question.memory.recall(what, key, Cloud, work))
     return Fit(effects, step, prior, tuple(c.log_evidence for c in clouds), tuple(clouds))
 
 

@@ -148,6 +148,11 @@ def posterior(question: Question, fit: Fit) -> Belief:
     return belief_of(fit.cloud, target)
 
 
+def model_name(effects: Sequence[Effect]) -> str:
+    """What to call the base model with these effects."""
+    return " + ".join(effect.name for effect in effects) or "the base model"
+
+
 def fit_stream(question: Question, effects: Sequence[Effect], seed: int) -> torch.Generator:
     """Random numbers of their own for every model and seed."""
     name = "+".join(effect.name for effect in effects)

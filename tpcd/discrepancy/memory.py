@@ -24,6 +24,10 @@ from tpcd.errors import RunError
 T = TypeVar("T")
 
 
+def _unwatched(what: str) -> None:
+    """Nobody watches."""
+
+
 @dataclass(frozen=True)
 class Memory:
     """A folder of what was worked out; None keeps nothing."""
@@ -31,12 +35,16 @@ class Memory:
     folder: Path | None = None
     salt: str = ""
     """Part of every key, such as a fingerprint of code that files hold."""
+    watch: Callable[[str], None] = _unwatched
+    """Told what comes next, in words: a diagnosis takes minutes."""
 
-    def recall(self, key: Sequence[object], kind: type[T], work: Callable[[], T]) -> T:
-        """A data class of tensors, numbers and tuples of them, from the folder or from `work`.
+    def recall(self, what: str, key: Sequence[object], kind: type[T], work: Callable[[], T]) -> T:
+        """A data class of tensors, numbers and tuples of them, from the folder or from `work`;
+        `what` is it, in words.
 
         Raises `RunError` for a file that cannot be read.
         """
+        self.watch(what)
         if self.folder is None:
             return work()
         path = self.folder / f"{digest(self.salt, *key)}.safetensors"

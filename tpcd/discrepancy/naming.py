@@ -58,6 +58,7 @@ def find_confusions(bench: Workbench, base: Fit) -> None:
     for effect in bench.settings.catalogue:
 
         def own(effect: Effect = effect) -> Float[Tensor, "k r"]:
+            bench.begin(f"what {effect.name} would do to these data")
             rows = signatures(bench.question, base, [effect])[effect.name]
             bench.reach[effect.name] = reach_of(bench.question, base, effect, rows)
             return rows

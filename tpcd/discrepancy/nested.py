@@ -57,8 +57,9 @@ def nested_gain(question: Question, base: Fit, look: Glance) -> NestedGain:
     prior = question.scene.with_effects(effects)
     names = tuple(effect.name for effect in effects)
     key = ("nested", question.fingerprint, names, prior.low, prior.high, base.fingerprint)
+    what = f"gain of {look.effect.name} by draws"
     return question.memory.recall(
-        (*key, look.place), NestedGain, lambda: _weighed(question, base, look)
+        what, (*key, look.place), NestedGain, lambda: _weighed(question, base, look)
     )
 
 

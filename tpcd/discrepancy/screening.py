@@ -20,7 +20,7 @@ from tpcd.belief.modes import Climbers, climb, set_out
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.target import ContactTarget
 from tpcd.discrepancy.carrying import carried
-from tpcd.discrepancy.fit import Fit, Question, fit_stream
+from tpcd.discrepancy.fit import Fit, Question, fit_stream, model_name
 from tpcd.effects.protocol import Effect, EffectParameter, effect_parameters
 
 PLACES = 16
@@ -96,8 +96,9 @@ def peak(
     scattered = SCATTERED[explained] if _says_where(prior, new) else 0
     model = (names, prior.low, prior.high, base.fingerprint, fresh, scattered)
     key = ("peak", question.fingerprint, *model)
+    what = f"look at {model_name(effects)}"
     return question.memory.recall(
-        key, Peak, lambda: _climbed(question, base, prior, new, fresh, scattered)
+        what, key, Peak, lambda: _climbed(question, base, prior, new, fresh, scattered)
     )
 
 

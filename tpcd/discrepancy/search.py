@@ -202,6 +202,7 @@ def _search(bench: Workbench, effects: tuple[Effect, ...]) -> Findings:
         stage += 1
     after = bench.adequacy(current)
     _tell_adequacy(bench, "the model found", after)
+    bench.begin("steps cut further")
     halving = bench.attempt("steps cut further", lambda: step_halving(bench.question, current))
     if halving is not None:
         bench.notes.append(

@@ -14,7 +14,7 @@ from tpcd.discrepancy.confusion import Reach
 from tpcd.discrepancy.coverage import Coverage
 from tpcd.discrepancy.diagnosis import Candidate, Confusion
 from tpcd.discrepancy.evidence import fit_model
-from tpcd.discrepancy.fit import Fit, Question, joined_fit
+from tpcd.discrepancy.fit import Fit, Question, joined_fit, model_name
 from tpcd.discrepancy.heldout import held_out_scores, lower_bound
 from tpcd.discrepancy.screening import Glance
 from tpcd.discrepancy.settings import (
@@ -59,6 +59,10 @@ class Workbench:
     left: dict[str, Adequacy] = field(default_factory=dict)
     """What models leave, by the fingerprints of question and fit."""
 
+    def begin(self, what: str) -> None:
+        """Say what comes next, to whoever watches."""
+        self.question.memory.watch(what)
+
     def warn(self, line: str) -> None:
         """Note something, and say it at once."""
         self.notes.append(" ".join(line.split()))
@@ -73,6 +77,7 @@ class Workbench:
         """What a model leaves."""
         key = self.question.fingerprint + fit.fingerprint
         if key not in self.left:
+            self.begin(f"what {model_name(fit.effects)} leaves")
             generator = stream(self.settings.seed, 78)
             self.left[key] = check_adequacy(self.question, fit, generator)
         return self.left[key]
@@ -131,9 +136,8 @@ def fitted_again(
 ) -> Fit:
     """The fit with one more seed of its model, as for `fit_model`; as it is where that fails."""
     asked = bench.question if question is None else question
-    model = ", ".join(fit.names) or "the base model"
     again = bench.attempt(
-        f"{model} failed when fitted again",
+        f"{model_name(fit.effects)} failed when fitted again",
         lambda: fit_model(asked, fit.effects, (seed,), start=start, places=places),
     )
     return fit if again is None else joined_fit(fit, again)
@@ -184,6 +188,7 @@ def stands(
         own, base = (held_out_scores(bench.question, fit) for fit in (best, current))
         return lower_bound(own - base, stream(bench.settings.seed, 77, number), VETO_LEVEL)
 
+    bench.begin(f"{model_name(best.effects)} on blocks held out")
     held = bench.attempt(f"{best.names[-1]} failed on blocks held out", bound)
     if held is None:
         return False, f"{reason}, not told on blocks held out"

@@ -18,6 +18,7 @@ from tpcd.belief import kernel as filtered, mixture_kernel
 from tpcd.compile_ahead import compile_loops
 from tpcd.contact import scene_from_parameters
 from tpcd.effects.catalogue import find_effect
+from tpcd.effects.kernel_uneven import lay_range
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
@@ -26,13 +27,14 @@ from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
 compile_loops()
-loops = (kernel.step_range, filtered.explain_range, mixture_kernel.sum_range)
+loops = (kernel.step_range, filtered.explain_range, mixture_kernel.sum_range, lay_range)
 before = [len(loop.signatures) for loop in loops]
 generator = torch.Generator().manual_seed(1)
 scene = draw_scene("milk_carton", builtin_outlines()["milk_carton"].vertices, generator)
 motion = make_motion("rich", scene, 2, generator)
 episode = record(make_truth(scene, "quasistatic"), scene, motion, 2, generator).measured
-for effects in ((), (find_effect("wall_compliance"), find_effect("grasp_compliance"))):
+other = (("wall_compliance", "grasp_compliance"), ("floor_height ~ bump",))
+for effects in ((), *(tuple(map(find_effect, names)) for names in other)):
     settings = EstimatorSettings(sampler=SamplerSettings(particles=50), effects=effects)
     *_, last = estimate(episode, load_prior("ycb-rich"), generator, settings)
     ContactPredictor(last.belief).predict(episode.poses[:1], episode.commands[1:2])
@@ -48,7 +50,7 @@ def test_nothing_is_left_to_compile_for_an_estimate() -> None:
     found = subprocess.run(
         [sys.executable, "-c", USE], capture_output=True, text=True, check=False, timeout=500
     )
-    assert found.stdout.strip() == "[2, 2, 1] [2, 2, 1]", found.stderr
+    assert found.stdout.strip() == "[2, 2, 1, 1] [2, 2, 1, 1]", found.stderr
 
 
 def test_without_numba_there_is_nothing_to_compile(monkeypatch, capsys) -> None:

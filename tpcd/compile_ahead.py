@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 from tpcd.cli import run
 
+_MODELS = ("floor_compliance", "floor_height ~ wave")
+
 
 def compile_loops() -> None:
     """Simulate two steps of contact and learn from them, by all loops that estimation needs, on
-    rigid terrain and on terrain that yields."""
+    rigid terrain, on terrain that yields and on an uneven floor."""
     import torch
 
     from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
@@ -31,7 +33,7 @@ def compile_loops() -> None:
     scene = draw_scene("mug", outline.vertices, generator)
     motion = make_motion("rich", scene, 2, generator)
     episode = record(make_truth(scene, "quasistatic"), scene, motion, 2, generator).measured
-    for effects in ((), (find_effect("floor_compliance"),)):
+    for effects in ((), *((find_effect(name),) for name in _MODELS)):
         settings = EstimatorSettings(sampler=SamplerSettings(particles=20), effects=effects)
         *_, last = estimate(episode, PolygonShape(outline), generator, settings)
         ContactPredictor(last.belief).predict(

@@ -13,15 +13,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows
 from tpcd.effects.declare import DeclaredEffect, column
 from tpcd.effects.geometry import with_plane
 from tpcd.effects.protocol import EffectParameter
 from tpcd.planar import rotate
+from tpcd.simulator import native
+from tpcd.simulator.step import needs_gradient
 
 Relief = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """From the k parameters (m, k) of an effect and places x (m, r, p) [m] along the floor to heights
@@ -30,6 +35,8 @@ NEAR = 0.02
 """Points that are further from the floor than this [m] only have to stay away from it."""
 _RAMP = 0.0025
 """Half width of the ramp at a step of the floor [m]."""
+_PITCH, _LONGEST = 0.00025, 2.0
+"""In compiled loops a relief is looked up between places so far apart, along so much floor [m]."""
 _PARTS, _PASSES = 2, 2
 """As in `Effect`: more of either leave fewer rows wrong, and take longer (`eval/EVIDENCE.md`)."""
 
@@ -45,14 +52,38 @@ def on_uneven(
     adds to `warp` (m, r, p, 2) [m] in the end-effector frame. Rows that follow no other stay as
     they are.
     """
-    angle = outcome.view[..., 2:] + conditions.turn
-    x, z = (rotate(angle, outcome.outline[:, None]) + outcome.view[..., None, :2]).unbind(-1)
-    normal, offset = conditions.normal[:, :, FLOOR], conditions.offset[:, :, FLOOR, None]
+    view = outcome.view + pad(conditions.turn, (2, 0))
+    stays = rows.follows == torch.arange(len(rows.follows), device=view.device)
+    normal = conditions.normal[:, :, FLOOR].expand(*view.shape[:2], 2)
+    offset = conditions.offset[:, :, FLOOR].expand(view.shape[:2])
+    arguments = (outcome.outline, view, normal, offset, stays, values, relief)
+    warp, normal, offset = _laid_compiled(*arguments) or _laid(*arguments)
+    if bool(warp.any()):
+        warp = conditions.warp + warp if conditions.warps else warp
+        conditions = replace(conditions, warp=warp)
+    return with_plane(conditions, FLOOR, normal, offset)
+
+
+_Laid = tuple[Tensor, Tensor, Tensor]
+"""What points are moved by (m, r, p, 2), and normals (m, r, 2) and offsets (m, r) of tangents."""
+
+
+def _laid(
+    outline: Tensor,
+    view: Tensor,
+    normal: Tensor,
+    offset: Tensor,
+    stays: Tensor,
+    values: Tensor,
+    relief: Relief,
+) -> _Laid:
+    """Outlines (m, p, 2) at poses `view` (m, r, 3) over a floor; rows that stay meet its plane."""
+    angle = view[..., 2:]
+    x, z = (rotate(angle, outline[:, None]) + view[..., None, :2]).unbind(-1)
     rise, slope = relief(values, x)
-    first = (rows.follows == torch.arange(len(rows.follows), device=x.device))[:, None]
-    flat = first | ((rise == 0) & (slope == 0)).all(-1, keepdim=True)
+    flat = stays[:, None] | ((rise == 0) & (slope == 0)).all(-1, keepdim=True)
     across, along = normal[..., :1], normal[..., 1:]
-    floor = (offset - across * x) / along + rise
+    floor = (offset[..., None] - across * x) / along + rise
     slope = slope - across / along
     gap = z - floor
     nearest = (gap * (1 + slope**2).rsqrt()).argmin(-1, keepdim=True)
@@ -60,14 +91,44 @@ def on_uneven(
     above = z - (at_z + steep * (x - at_x))
     up = torch.where(gap < NEAR, gap, above.clamp_min(NEAR)) - above
     up = torch.where(flat, 0.0, up)
-    warp = conditions.warp
-    if bool(up.any()):
-        warp = warp + up[..., None] * torch.stack((angle.sin(), angle.cos()), dim=-1)
     length = (1 + steep**2).sqrt()
     tangent = torch.cat((-steep, torch.ones_like(steep)), dim=-1) / length
-    tangent = torch.where(flat, normal, tangent)
-    through = torch.where(flat, offset, (at_z - steep * at_x) / length)
-    return with_plane(replace(conditions, warp=warp), FLOOR, tangent, through[..., 0])
+    through = torch.where(flat[..., 0], offset, ((at_z - steep * at_x) / length)[..., 0])
+    warp = up[..., None] * torch.stack((angle.sin(), angle.cos()), dim=-1)
+    return warp, torch.where(flat, normal, tangent), through
+
+
+def _laid_compiled(
+    outline: Tensor,
+    view: Tensor,
+    normal: Tensor,
+    offset: Tensor,
+    stays: Tensor,
+    values: Tensor,
+    relief: Relief,
+) -> _Laid | None:
+    """The same in compiled loops, with the relief looked up; None where that cannot be."""
+    inputs = (outline, view, normal, offset, values)
+    if view.device.type != "cpu" or not native.available() or needs_gradient(*inputs):
+        return None
+    seen, reach = view[..., 0].nan_to_num(), float(outline.norm(dim=-1).max())
+    first = math.floor((float(seen.min()) - reach) / _PITCH)
+    cells = math.ceil((float(seen.max()) + reach) / _PITCH) - first
+    if cells * _PITCH > _LONGEST:
+        return None
+    from tpcd.effects.kernel_uneven import Laid, Profile, lay_range
+
+    # Multiples of the pitch, so that where others are changes nothing.
+    places = _PITCH * torch.arange(first, first + cells + 1, dtype=view.dtype)
+    rise, slope = (part[:, 0].contiguous().numpy() for part in relief(values, places[None, None]))
+    count, rows, points = *view.shape[:2], outline.shape[1]
+    shapes = ((count, rows, 2), (count, rows), (count, rows, 2, points))
+    laid = Laid(*(np.empty(shape) for shape in shapes))
+    given = (value.contiguous().numpy() for value in (outline.mT, view, normal, offset, stays))
+    work = partial(lay_range, *given, Profile(rise, slope, first, _PITCH), NEAR, laid)
+    native.in_parts(work, count, rows)
+    tangent, through, warp = (torch.from_numpy(value) for value in laid)
+    return warp.mT, tangent, through
 
 
 def _step(values: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

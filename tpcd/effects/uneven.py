@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -56,28 +57,32 @@ def on_uneven(
     stays = rows.follows == torch.arange(len(rows.follows), device=view.device)
     normal = conditions.normal[:, :, FLOOR].expand(*view.shape[:2], 2)
     offset = conditions.offset[:, :, FLOOR].expand(view.shape[:2])
-    arguments = (outcome.outline, view, normal, offset, stays, values, relief)
-    warp, normal, offset = _laid_compiled(*arguments) or _laid(*arguments)
+    seen = _Seen(outcome.outline, view, normal, offset, stays)
+    warp, normal, offset = _laid_compiled(seen, values, relief) or _laid(seen, values, relief)
     if bool(warp.any()):
         warp = conditions.warp + warp if conditions.warps else warp
         conditions = replace(conditions, warp=warp)
     return with_plane(conditions, FLOOR, normal, offset)
 
 
+class _Seen(NamedTuple):
+    """Outlines (m, p, 2) at poses `view` (m, r, 3) over planes with normals (m, r, 2) and offsets
+    (m, r); rows that stay, (r,), meet the plane as it is."""
+
+    outline: Tensor
+    view: Tensor
+    normal: Tensor
+    offset: Tensor
+    stays: Tensor
+
+
 _Laid = tuple[Tensor, Tensor, Tensor]
 """What points are moved by (m, r, p, 2), and normals (m, r, 2) and offsets (m, r) of tangents."""
 
 
-def _laid(
-    outline: Tensor,
-    view: Tensor,
-    normal: Tensor,
-    offset: Tensor,
-    stays: Tensor,
-    values: Tensor,
-    relief: Relief,
-) -> _Laid:
-    """Outlines (m, p, 2) at poses `view` (m, r, 3) over a floor; rows that stay meet its plane."""
+def _laid(seen: _Seen, values: Tensor, relief: Relief) -> _Laid:
+    """Outlines over a relief."""
+    outline, view, normal, offset, stays = seen
     angle = view[..., 2:]
     x, z = (rotate(angle, outline[:, None]) + view[..., None, :2]).unbind(-1)
     rise, slope = relief(values, x)
@@ -98,30 +103,26 @@ def _laid(
     return warp, torch.where(flat, normal, tangent), through
 
 
-def _laid_compiled(
-    outline: Tensor,
-    view: Tensor,
-    normal: Tensor,
-    offset: Tensor,
-    stays: Tensor,
-    values: Tensor,
-    relief: Relief,
-) -> _Laid | None:
+def _laid_compiled(seen: _Seen, values: Tensor, relief: Relief) -> _Laid | None:
     """The same in compiled loops, with the relief looked up; None where that cannot be."""
+    outline, view, normal, offset, stays = seen
     inputs = (outline, view, normal, offset, values)
     if view.device.type != "cpu" or not native.available() or needs_gradient(*inputs):
         return None
-    seen, reach = view[..., 0].nan_to_num(), float(outline.norm(dim=-1).max())
-    first = math.floor((float(seen.min()) - reach) / _PITCH)
-    cells = math.ceil((float(seen.max()) + reach) / _PITCH) - first
+    x, reach = view[..., 0].nan_to_num(), float(outline.norm(dim=-1).nan_to_num().max())
+    first = math.floor((float(x.min()) - reach) / _PITCH)
+    cells = math.ceil((float(x.max()) + reach) / _PITCH) - first
     if cells * _PITCH > _LONGEST:
         return None
     from tpcd.effects.kernel_uneven import Laid, Profile, lay_range
 
     # Multiples of the pitch, so that where others are changes nothing.
     places = _PITCH * torch.arange(first, first + cells + 1, dtype=view.dtype)
-    rise, slope = (part[:, 0].contiguous().numpy() for part in relief(values, places[None, None]))
     count, rows, points = *view.shape[:2], outline.shape[1]
+    rise, slope = (
+        part[:, 0].expand(count, -1).contiguous().numpy()
+        for part in relief(values, places[None, None])
+    )
     shapes = ((count, rows, 2), (count, rows), (count, rows, 2, points))
     laid = Laid(*(np.empty(shape) for shape in shapes))
     given = (value.contiguous().numpy() for value in (outline.mT, view, normal, offset, stays))

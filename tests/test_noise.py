@@ -103,6 +103,9 @@ def test_right_noise_is_not_doubted(seed: int) -> None:
     for steps in (15, 30, 60):
         assert check_noise(episode_of(seed, steps)) == []
     assert check_noise(stated(episode_of(seed), 1.5, slice(0, 6))) == []
+    # Too small by as much may be doubted, but is not refused.
+    told = check_noise(stated(episode_of(seed), 1 / 1.5, slice(0, 6)))
+    assert all("too small, or the arm creeps or lags" in line for line in told)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

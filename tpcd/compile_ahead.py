@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from tpcd.cli import run
 
 _MODELS = ("floor_compliance", "floor_height ~ wave")
+"""Effects that need loops of their own: of terrain that yields, and of an uneven floor."""
 
 
 def compile_loops() -> None:

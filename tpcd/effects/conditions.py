@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from tpcd.contact import ContactScene
 from tpcd.planar import wrap_angle
@@ -142,6 +143,11 @@ class Conditions:
     def target(self) -> Float[Tensor, "#m #r 3"]:
         """Command at which the arm, without other loads, feels the same contact."""
         return self.command + (self.load + self.pull) / self.stiffness
+
+    @property
+    def turned(self) -> Float[Tensor, "#m #r 3"]:
+        """`turn` as a change of pose [m, m, rad]."""
+        return pad(self.turn, (2, 0))
 
     def stiffness_along(self, direction: Float[Tensor, "m r 2"]) -> Float[Tensor, "m r"]:
         """Of the arm, along unit vectors [N/m]."""

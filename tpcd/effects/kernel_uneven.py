@@ -12,7 +12,7 @@ from numba import njit
 
 class Profile(NamedTuple):
     """Heights [m] over a plane and slopes (m, g) at places (`first` + k) `pitch` [m] along it,
-    between which cubic Hermite splines are taken."""
+    between which cubic Hermite splines are taken (de Boor 1978, chapter IV)."""
 
     rise: np.ndarray
     slope: np.ndarray
@@ -34,7 +34,8 @@ class Laid(NamedTuple):
 @no_type_check
 def lay_range(outline, view, normal, offset, stays, profile, near, laid, first, last):
     """Particles from `first` up to `last`: outlines (m, 2, p) at poses `view` (m, r, 3) over floors
-    with planes `normal` (m, r, 2) and `offset` (m, r). Rows that stay, (r,), are over the plane."""
+    with planes `normal` (m, r, 2) and `offset` (m, r) [m]. Rows that stay, (r,), are over the
+    plane; points further from the floor than `near` [m] only stay away from the tangent."""
     cells, count = profile.rise.shape[1] - 1, outline.shape[2]
     cubic = np.empty((cells, 4))
     x, z, gap, slope, away = np.empty((5, count))

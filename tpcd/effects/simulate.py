@@ -176,7 +176,7 @@ def _settle(
     if gap is not None:
         here = here.further(gap[:, index])
     before = rows.follows[index]
-    target, turn = conditions.target, _pose(conditions.turn)
+    target, turn = conditions.target, conditions.turned
     starts, commands, previous = torch.broadcast_tensors(
         rows.starts[..., index, :] + _at(turn, before),
         _at(target - conditions.carried, index) + _at(turn, index),
@@ -194,7 +194,7 @@ def _settle(
 
 def _moved(conditions: Conditions, index: Tensor) -> Tensor:
     """From the pose of the object as seen from the ground to that of the end effector."""
-    return _at(conditions.give, index) - _at(_pose(conditions.turn), index)
+    return _at(conditions.give, index) - _at(conditions.turned, index)
 
 
 def _at_rest(scene: ContactScene, rows: Rows) -> Outcome:
@@ -239,8 +239,3 @@ def _along(rows: Tensor, value: Tensor) -> Tensor:
 def _at(value: Tensor, index: Tensor) -> Tensor:
     """The value (m, r, ...) at some rows; r may be 1."""
     return value if value.shape[1] == 1 else value[:, index]
-
-
-def _pose(turn: Tensor) -> Tensor:
-    """The turn as a change of pose."""
-    return torch.cat((torch.zeros_like(turn), torch.zeros_like(turn), turn), dim=-1)

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows
 from tpcd.effects.declare import DeclaredEffect, column
@@ -53,7 +52,7 @@ def on_uneven(
     adds to `warp` (m, r, p, 2) [m] in the end-effector frame. Rows that follow no other stay as
     they are.
     """
-    view = outcome.view + pad(conditions.turn, (2, 0))
+    view = outcome.view + conditions.turned
     stays = rows.follows == torch.arange(len(rows.follows), device=view.device)
     normal = conditions.normal[:, :, FLOOR].expand(*view.shape[:2], 2)
     offset = conditions.offset[:, :, FLOOR].expand(view.shape[:2])

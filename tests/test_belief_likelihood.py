@@ -14,7 +14,7 @@ from tpcd.belief.belief import estimate
 from tpcd.belief.compiled import compiled_filter
 from tpcd.belief.filtered import HistoryLikelihood, filter_history
 from tpcd.belief.free_start import free_starts, start_gaps
-from tpcd.belief.history import History, history_of, parity_chi_square
+from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import effective_setting, highest_terms, history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
@@ -72,7 +72,7 @@ def test_merging_pose_and_wrench_keeps_what_a_normal_of_six_dimensions_says(
     def three(settled: Tensor) -> Tensor:
         return -0.5 * ((history.settled - settled) ** 2 / history.variance[1:]).sum(-1)
 
-    good = parity_chi_square(episode)[1:] <= PARITY_LIMIT
+    good = history_of(episode).merged.chi_square[0, 1:] <= PARITY_LIMIT
     assert good.any()
     torch.testing.assert_close(
         (six(poses[0]) - six(poses[1]))[good], (three(poses[0]) - three(poses[1]))[good]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from tpcd.belief import resampling
 from tpcd.belief.resampling import (
     effective_sample_size,
-    multinomial_resample,
     normalise_log_weights,
     systematic_resample,
     weighted_place,
@@ -57,7 +56,6 @@ def test_minus_infinity_has_weight_zero_and_one_dominant_takes_all() -> None:
     assert weights.tolist() == [0.0, 1.0, 0.0]
     assert effective_sample_size(weights) == 1.0
     assert systematic_resample(weights, 5, generator()).tolist() == [1] * 5
-    assert multinomial_resample(weights, 5, generator()).tolist() == [1] * 5
 
 
 @pytest.mark.parametrize("values", [[-math.inf, -math.inf], [math.nan, 0.0], [math.inf, 0.0]])
@@ -93,14 +91,6 @@ def test_draws_exactly_on_an_edge_never_pick_a_zero_weight(
     index = systematic_resample(weights, 4, generator())
     assert (weights[index] > 0).all()
     assert torch.bincount(index, minlength=6).sub(4 * weights).abs().max() <= 1
-
-
-def test_multinomial_draws_have_the_right_mean() -> None:
-    weights = torch.tensor([0.1, 0.0, 0.6, 0.3], dtype=torch.float64)
-    index = multinomial_resample(weights, 20_000, generator())
-    found = torch.bincount(index, minlength=4) / 20_000
-    assert (found - weights).abs().max() < 0.015
-    assert found[1] == 0
 
 
 @pytest.mark.parametrize("count", [20, 37, 150])

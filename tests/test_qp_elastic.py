@@ -72,6 +72,7 @@ def test_jammed_contacts_get_finite_answers_that_satisfy_the_relaxed_conditions(
 def test_the_compromise_minimises_motion_and_squared_violation_together(engine):
     problem = random_contact_problems(300, 8, 1, JAMMING)
     solution = solve(problem, engine)
+    assert 5 < int((solution.status == Status.RELAXED).sum()) < 95
     root = problem.hessian.diagonal().sqrt()
     whitened = problem.rows / root
     lengths = whitened.norm(dim=-1)
@@ -128,11 +129,12 @@ def test_an_impossible_row_without_direction_leaves_the_motion_alone(engine):
     torch.testing.assert_close(solution.motion, target, rtol=0, atol=1e-14)
 
 
-def test_the_compiled_fallback_agrees_with_the_door(engine):
-    from tpcd.qp.compiled import normalise_rows, solve_elastic_3, solve_whitened_3
+def test_the_compiled_solver_agrees_with_the_door(engine):
+    from tpcd.qp.compiled import solve_whitened_3
 
     problem = random_contact_problems(100, 8, 3, JAMMING)
     solution = solve(problem, engine)
+    assert 5 < int((solution.status == Status.RELAXED).sum()) < 95
     root = problem.hessian.diagonal().sqrt().numpy()
     for element in range(100):
         mask = problem.row_mask[element].numpy()
@@ -142,14 +144,14 @@ def test_the_compiled_fallback_agrees_with_the_door(engine):
         offsets = raw @ target + problem.offsets[element].numpy()[mask]
         sizes = np.abs(raw) @ np.abs(target) + np.abs(problem.offsets[element].numpy()[mask])
         m = len(offsets)
-        lengths, multipliers = np.empty(m), np.empty(m)
+        lengths, multipliers = np.linalg.norm(rows, axis=1), np.empty(m)
         motion, slots, work = np.empty(3), np.empty(3, np.int64), np.empty((8, 3))
-        normalise_rows(rows, offsets, sizes, lengths, m)
+        rows, offsets, sizes = rows / lengths[:, None], offsets / lengths, sizes / lengths
         status, _ = solve_whitened_3(rows, offsets, sizes, m, motion, multipliers, slots, work)
         if status == Status.INFEASIBLE:
-            status, _ = solve_elastic_3(rows, offsets, sizes, m, motion, multipliers, slots)
             assert solution.status[element] == Status.RELAXED
-        assert status == Status.SOLVED
+            continue
+        assert status == solution.status[element] == Status.SOLVED
         expected = (solution.motion[element].numpy() - target) * root
         np.testing.assert_allclose(motion, expected, rtol=0, atol=1e-9)
         carried = solution.multipliers[element].numpy()[mask]

@@ -86,8 +86,6 @@ def test_reset_starts_the_same_episode_again():
         truth.reset(vector(0.0, 0.06, 0.0))
         runs.append(torch.cat([torch.cat(truth.step(vector(*c))[:2]) for c in random_commands(2)]))
     assert torch.equal(*runs)
-    with pytest.raises(NotImplementedError):
-        truth.step_from(vector(0.0, 0.06, 0.0), vector(0.0, 0.06, 0.0))
 
 
 def test_a_compliant_floor_sinks_by_compliance_times_load():

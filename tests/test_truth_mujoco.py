@@ -160,15 +160,6 @@ def test_the_same_commands_give_the_same_bits():
     assert np.array_equal(rollout(truth, commands), rollout(truth, commands))
 
 
-def test_a_step_from_rest_equals_a_step_after_reset():
-    vertices, friction, commands = random_scene(8)
-    truth = make_truth(vertices, friction)
-    truth.reset(commands[0])
-    pose, wrench, _ = truth.step(commands[1])
-    again = truth.step_from(commands[0], commands[1])
-    assert torch.equal(pose, again[0]) and torch.equal(wrench, again[1])
-
-
 def test_what_has_no_meaning_is_refused():
     with pytest.raises(ValueError, match="friction"):
         make_truth(friction=-0.1)

@@ -48,10 +48,6 @@ class FlatFloor:
         pose = torch.cat((command[:1], command[1:2].clamp(min=0.05), command[2:]))
         return pose, torch.tensor([100.0, 100.0, 50.0]).double() * (pose - command), True
 
-    def step_from(self, pose, command):
-        """There is no memory."""
-        return self.step(command)
-
 
 def touches(scene: Scene, poses: torch.Tensor) -> np.ndarray:
     return np.array([scene.clearances(pose) for pose in poses]) < TOUCHING

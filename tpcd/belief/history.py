@@ -155,8 +155,3 @@ def joined_history(episodes: Sequence[Episode], least_std: float = 2e-5) -> Hist
     seams[ends - 1] = True
     merged = merge(readings, variance, bare_conditions(commands, stiffness))
     return History(commands, readings, variance, stiffness, merged, ~seams, seams)
-
-
-def parity_chi_square(episode: Episode, least_std: float = 2e-5) -> Float[Tensor, " n"]:
-    """Chi-square (3 degrees of freedom) of w - K (x - u) for each row; see `setting`."""
-    return history_of(episode, least_std).merged.chi_square[0]

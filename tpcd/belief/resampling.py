@@ -42,18 +42,6 @@ def systematic_resample(
     return index.clamp(max=last)
 
 
-def multinomial_resample(
-    weights: Float[Tensor, " m"], count: int, generator: torch.Generator
-) -> Int[Tensor, " count"]:
-    """Draw `count` independent ancestors."""
-    cumulative = weights.double().cumsum(0)
-    share = torch.rand(count, generator=generator, dtype=torch.float64)
-    positions = share.to(cumulative.device) * cumulative[-1]
-    index = torch.searchsorted(cumulative, positions, right=True)
-    last = int(torch.nonzero(weights > 0).max())
-    return index.clamp(max=last)
-
-
 def weighted_quantile(
     values: Float[Tensor, " m *columns"],
     weights: Float[Tensor, " m"],

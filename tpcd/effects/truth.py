@@ -95,9 +95,3 @@ class EffectTruth:
         settled = bool(found.transition.status[0, -1] == int(StepStatus.CONVERGED))
         self._poses = torch.cat((self._poses, pose[None]))
         return pose, found.wrench[0, -1], settled
-
-    def step_from(
-        self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]
-    ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
-        """Not to be had: effects depend on the rows before."""
-        raise NotImplementedError("effects depend on the rows before; use reset and step")

@@ -4,16 +4,14 @@ Same method, tolerances and choices as exact.py, which has the mathematics; noth
 allocated inside. Import this module only where numba is installed. Any `numba.njit`
 function can call
 
-    normalise_rows(rows, offsets, magnitudes, lengths, m)
     status, steps = solve_whitened_3(
         rows, offsets, magnitudes, m, motion, multipliers, slots, work
     )
-    status, steps = solve_elastic_3(rows, offsets, magnitudes, m, motion, multipliers, slots)
 
 They work in whitened coordinates with target 0: minimise 1/2 |w|^2 subject to
 rows[i]·w + offsets[i] >= 0 for i < m, with the arrays (all float64, C-contiguous)
 
-    rows        (>= m, 3)  in: UNIT rows L^-1 a / length (`normalise_rows` makes them so)
+    rows        (>= m, 3)  in: UNIT rows L^-1 a / length
     offsets     (>= m)     in: whitened offsets, divided by the same length; finite
     magnitudes  (>= m)     in: size of the numbers each offset is the sum of (>= |offset|);
                            1e-13 times it is the violation that is left as rounding
@@ -22,8 +20,7 @@ rows[i]·w + offsets[i] >= 0 for i < m, with the arrays (all float64, C-contiguo
     slots       (3) int64  out: indices of the active rows, then -1
     work        (8, 3)     scratch
 
-`status` is an int code of `Status`: SOLVED, INFEASIBLE or ITERATION_LIMIT. What
-`solve_whitened_3` found INFEASIBLE, `solve_elastic_3` answers (it allocates).
+`status` is an int code of `Status`: SOLVED, INFEASIBLE or ITERATION_LIMIT.
 
 `no_type_check` keeps the tests' import hook, which wraps functions, away from what numba
 compiles.
@@ -36,7 +33,6 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from tpcd.qp.elastic import RELAXATION
 from tpcd.qp.exact import DEPENDENCE_TOLERANCE, RATIO_TOLERANCE, VIOLATION_TOLERANCE
 from tpcd.qp.problem import Status
 
@@ -68,69 +64,6 @@ def solve_whitened(rows, offsets, magnitudes, m, n, limit, motion, multipliers, 
     return solve_rows(
         rows, offsets, magnitudes, m, n, len(slots), limit, motion, multipliers, slots, work
     )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def normalise_rows(rows, offsets, magnitudes, lengths, m):
-    """Divide m whitened rows, offsets and magnitudes by the rows' lengths, in place."""
-    n = rows.shape[1]
-    for row in range(m):
-        square = 0.0
-        for i in range(n):
-            square += rows[row, i] * rows[row, i]
-        length = np.sqrt(square)
-        if not length > 0.0:
-            length = 1.0
-        lengths[row] = length
-        offsets[row] /= length
-        magnitudes[row] /= length
-        for i in range(n):
-            rows[row, i] /= length
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def solve_elastic_3(rows, offsets, magnitudes, m, motion, multipliers, slots):
-    """Answer one infeasible whitened problem by the elastic fallback of elastic.py.
-
-    Arrays as for `solve_whitened_3`; `slots` gets up to 3 of the active rows (more may be
-    active: those with a positive multiplier). Allocates, since it is rare.
-    """
-    n = 3 + m
-    spring = np.sqrt(RELAXATION)
-    length = np.sqrt(1.0 + RELAXATION)
-    wide_rows = np.zeros((m, n))
-    wide_offsets = np.empty(m)
-    wide_magnitudes = np.empty(m)
-    for row in range(m):
-        for i in range(3):
-            wide_rows[row, i] = rows[row, i] / length
-        wide_rows[row, 3 + row] = spring / length
-        wide_offsets[row] = offsets[row] / length
-        wide_magnitudes[row] = magnitudes[row] / length
-    wide_motion = np.empty(n)
-    wide_slots = np.empty(m, np.int64)
-    work = np.empty((m + 5, n))
-    status, steps = solve_whitened(
-        wide_rows,
-        wide_offsets,
-        wide_magnitudes,
-        m,
-        n,
-        10 * (m + n),
-        wide_motion,
-        multipliers,
-        wide_slots,
-        work,
-    )
-    for i in range(3):
-        motion[i] = wide_motion[i]
-    for a in range(slots.shape[0]):
-        slots[a] = wide_slots[a] if a < m else -1
-    for row in range(m):
-        multipliers[row] /= length
-    return status, steps
 
 
 @njit(inline="always", error_model="numpy")

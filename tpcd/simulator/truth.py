@@ -53,26 +53,14 @@ class QuasistaticTruth:
         self, command: Float[Tensor, " 3"]
     ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
         """Move to a command; settled pose, wrench [N, N, N·m] and whether it settled."""
-        answer = self._settle(self._pose, self._command, command)
-        self._pose, self._command = answer[0], command.double()
-        return answer
-
-    def step_from(
-        self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]
-    ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
-        """One transition from rest at a pose, leaving the state alone."""
-        return self._settle(pose.double(), None, command)
-
-    def _settle(
-        self, pose: Tensor, previous: Tensor | None, command: Tensor
-    ) -> tuple[Tensor, Tensor, bool]:
         result = simulate_step(
             self._scene,
-            pose,
+            self._pose,
             command.double(),
             self._stiffness,
             self._settings,
-            previous=previous,
+            previous=self._command,
         )
+        self._pose, self._command = result.pose, command.double()
         settled = bool(result.status == int(StepStatus.CONVERGED))
         return result.pose, result.wrench, settled

@@ -126,10 +126,6 @@ class InjectedMujocoTruth:
             wrench = torch.from_numpy(self._stiffness * (pose.numpy() - self._pursued))
         return *sensor_effects(self._hidden, pose, wrench, share), settled
 
-    def step_from(self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]) -> Transition:
-        """Not offered: several effects depend on the row and on what came before."""
-        raise NotImplementedError("a truth with effects answers only to step, after reset")
-
     def external_wrench(self) -> Float[Tensor, " 3"]:
         """Contact, adhesion and load summed after the last `step`, before the sensor."""
         self._mujoco.mj_forward(self._model, self._data)

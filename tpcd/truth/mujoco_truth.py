@@ -55,12 +55,13 @@ class MujocoTruth:
         xml = scene_xml(hull, friction, floor_height, wall_position, self._stiffness, self.settings)
         self._model = self._mujoco.MjModel.from_xml_string(xml)
         self._data = self._mujoco.MjData(self._model)
-        self._isolated = self._mujoco.MjData(self._model)
         self._command = np.zeros(3)
 
     def reset(self, pose: Float[Tensor, " 3"]) -> None:
         """Put the arm at rest at a pose with the command equal to it [m, m, rad]."""
-        self._command = self._rest(self._data, pose)
+        self._mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = pose.numpy()
+        self._command = self._data.qpos.copy()
 
     def step(self, command: Float[Tensor, " 3"]) -> Transition:
         """Ramp from the last command to this one and hold until the arm stands still.
@@ -68,35 +69,23 @@ class MujocoTruth:
         Returns pose [m, m, rad], wrench K (pose - command) [N, N, N·m] and whether the arm
         settled within `hold_time`.
         """
-        start, self._command = self._command, command.numpy().astype(np.float64)
-        return self._move(self._data, start, self._command)
-
-    def step_from(self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]) -> Transition:
-        """One transition from rest at `pose`, the command starting there; keeps the state."""
-        start = self._rest(self._isolated, pose)
-        return self._move(self._isolated, start, command.numpy().astype(np.float64))
+        start, end = self._command, command.numpy().astype(np.float64)
+        if not np.isfinite((start, end)).all():
+            raise ValueError(f"command goes from {start} to {end}, expected finite numbers")
+        self._command = end
+        with stability_check(self._mujoco, self._data):
+            settled = ramp_and_hold(
+                lambda steps: self._mujoco.mj_step(self._model, self._data, steps),
+                self._data, start, end, self._stiffness, self.settings,
+            )  # fmt: skip
+        pose = self._data.qpos.copy()
+        wrench = self._stiffness * (pose - end)
+        return torch.from_numpy(pose), torch.from_numpy(wrench), settled
 
     def contact_wrench(self) -> Float[Tensor, " 3"]:
         """Wrench summed from the contact forces after the last `step`, which gives K (x' - u)."""
         self._mujoco.mj_forward(self._model, self._data)
         return torch.from_numpy(self._data.qfrc_constraint.copy())
-
-    def _rest(self, data: Any, pose: Tensor) -> np.ndarray:
-        self._mujoco.mj_resetData(self._model, data)
-        data.qpos[:] = pose.numpy()
-        return data.qpos.copy()
-
-    def _move(self, data: Any, start: np.ndarray, end: np.ndarray) -> Transition:
-        if not np.isfinite((start, end)).all():
-            raise ValueError(f"command goes from {start} to {end}, expected finite numbers")
-        with stability_check(self._mujoco, data):
-            settled = ramp_and_hold(
-                lambda steps: self._mujoco.mj_step(self._model, data, steps),
-                data, start, end, self._stiffness, self.settings,
-            )  # fmt: skip
-        pose = data.qpos.copy()
-        wrench = self._stiffness * (pose - end)
-        return torch.from_numpy(pose), torch.from_numpy(wrench), settled
 
 
 def ramp_and_hold(

@@ -27,9 +27,3 @@ class Truth(Protocol):
     ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
         """Move to a command; returns settled pose, wrench [N, N, N·m] and whether it settled."""
         ...
-
-    def step_from(
-        self, pose: Float[Tensor, " 3"], command: Float[Tensor, " 3"]
-    ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"], bool]:
-        """One transition from rest at a pose, whatever came before; same answer as `step`."""
-        ...

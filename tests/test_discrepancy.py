@@ -15,7 +15,7 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
+from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.conclude import Findings, conclude
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
@@ -24,6 +24,7 @@ from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
 from tpcd.discrepancy.gaps import Errors, Gaps
 from tpcd.discrepancy.heldout import folds
 from tpcd.discrepancy.memory import Memory
+from tpcd.discrepancy.preflight import free_space_score, parity_score
 from tpcd.discrepancy.report_parts import shown_value
 from tpcd.discrepancy.search import DiagnosisSettings, diagnose
 from tpcd.discrepancy.workbench import Workbench

@@ -1,19 +1,18 @@
 """Does a model explain the data at all? Tests of what it leaves, without an alternative.
 
 Under a true model the innovations of the filter are independent standard normal numbers, for
-every particle of the posterior. Cells of contact mode x channel x covariate ask whether any
-kind of transition departs from that, with the largest score compared to the largest of all
-cells in draws of standard normal numbers (max-T: Westfall and Young 1993). Innovations at the
-filter's border, which a model does not explain, are counted apart: stick and slip make a few of
-them under a true model too.
-
-The parity residual w - K (x - u) needs no theta and no contact model: it tells effects of the
-arm and of the sensors from all others.
+every particle of the posterior, and so is what pose and wrench say about each other, w - K (x - u)
+in units of its noise (parity). Innovations, in x, z and phi, are of the pose that both readings
+tell together, to which a wrench may add little; parity, in F_x, F_z and tau, is what is left of
+the wrench. Cells of contact mode x channel x covariate ask whether any kind of transition departs
+from that, with the largest score compared to the largest of all cells in draws of standard normal
+numbers (max-T: Westfall and Young 1993). Innovations at the filter's border, which a model does
+not explain, are counted apart: stick and slip make a few of them under a true model too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
 from dataclasses import dataclass
 
 import torch
@@ -26,25 +25,21 @@ from tpcd.belief.history import History
 from tpcd.belief.kalman import OUTLIER_SQUARE
 from tpcd.belief.likelihood import effective_setting, outcome_of
 from tpcd.contact import scene_from_parameters
-from tpcd.data.episode import Episode
-from tpcd.discrepancy.coverage import contact_rows
-from tpcd.discrepancy.diagnosis import Cell
+from tpcd.discrepancy.diagnosis import CHANNELS, Cell
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.effects.conditions import FLOOR, WALL, Outcome
-from tpcd.planar import wrap_angle
 from tpcd.simulator import native
 
 DRAWS = 4000
 """Draws of standard normal numbers for the largest score."""
 PARTICLES = 40
+TOLD_ROWS = 6
+"""Rows of those that are not explained which a sentence names."""
 FEWEST = 4
 """A cell needs so many transitions."""
 EXPECTED_UNEXPLAINED = 0.03
 """Share of transitions that a true model leaves at the border: stick and slip hang on less than
 anything that is measured."""
-CLEAR = 0.012
-"""So far from where anything met resistance a row is free [m]."""
-CHANNELS = ("x", "z", "phi")
 COVARIATES = ("mean", "size", "load", "place", "angle", "time")
 
 
@@ -60,15 +55,33 @@ class Adequacy:
     """Probability of as large a largest score under a true model."""
     cells: tuple[Cell, ...]
     """The cells, those with the largest scores first."""
+    beyond: tuple[tuple[int, str], ...] = ()
+    """Rows, counted through all episodes, that lie beyond the border for more than half of the
+    posterior, and what they touch."""
 
     def adequate(self, level: float) -> bool:
         """Whether nothing departs at this level."""
         return self.unexplained_p > level and self.cells_p > level
 
+    def left(self, level: float) -> str:
+        """What departs at this level, in words; empty where nothing does."""
+        told = []
+        if self.unexplained_p <= level:
+            text = f"{self.unexplained:.0%} of the transitions are not explained"
+            if self.beyond:
+                rows = [str(row) for row, _ in self.beyond[:TOLD_ROWS]]
+                more = " and more" if len(self.beyond) > TOLD_ROWS else ""
+                (mode, count), *_ = Counter(mode for _, mode in self.beyond).most_common(1)
+                text += f" (rows {', '.join(rows)}{more}; {count} of {len(self.beyond)}: {mode})"
+            told.append(text)
+        if self.cells and self.cells_p <= level:
+            told.append(self.cells[0].words)
+        return "; ".join(told)
+
 
 def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> Adequacy:
-    """Test the innovations of the posterior's best particles."""
-    whitened, outcome, weights = innovations(question, fit)
+    """Test innovations and parity of the posterior's best particles."""
+    whitened, parity, outcome, weights = _residuals(question, fit)
     history = question.history
     used = history.used
     square = (whitened**2).sum(-1)
@@ -79,19 +92,19 @@ def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> 
     explained = (1.0 - border) * used
     designs, names = _designs(history, outcome, modes, used)
     values = torch.where(explained[..., None] > 0, whitened.nan_to_num(0.0), 0.0)
-    mean = (weights[:, None, None] * values).sum(0)
-    share = (weights[:, None] * explained).sum(0)
-    noise = torch.randn(DRAWS, count, 3, generator=generator, dtype=torch.float64)
-    full = noise.new_zeros(DRAWS, len(used), 3)
+    mean = (weights[:, None, None] * torch.cat((values, parity), dim=-1)).sum(0)
+    shares = (weights @ explained, (used & history.read[1:]).double())
+    noise = torch.randn(DRAWS, count, len(CHANNELS), generator=generator, dtype=torch.float64)
+    full = noise.new_zeros(DRAWS, len(used), len(CHANNELS))
     full[:, used] = noise
     scores, largest = [], torch.zeros(DRAWS, dtype=torch.float64)
     for (mode, covariate), design in zip(names, designs, strict=True):
-        weight = design * share.sqrt()
-        norm = float(weight.norm())
-        if norm == 0:
-            continue
-        for channel in range(3):
-            data, drawn = mean[:, channel], full[:, :, channel]
+        for c, channel in enumerate(CHANNELS):
+            weight = design * shares[c // 3].sqrt()
+            norm = float(weight.norm())
+            if norm == 0:
+                continue
+            data, drawn = mean[:, c], full[:, :, c]
             if covariate == "size":
                 # The posterior's mean makes squares smaller; only large ones speak.
                 score = max(float(_size_score(data, weight)), 0.0)
@@ -99,8 +112,7 @@ def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> 
             else:
                 score, scored = float(weight @ data) / norm, drawn @ weight / norm
             largest = torch.maximum(largest, scored.abs())
-            rows = int((design != 0).sum())
-            scores.append(Cell(mode, CHANNELS[channel], covariate, score, rows))
+            scores.append(Cell(mode, channel, covariate, score, int((design != 0).sum())))
     scores.sort(key=lambda cell: -abs(cell.score))
     top = abs(scores[0].score) if scores else 0.0
     return Adequacy(
@@ -108,13 +120,18 @@ def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> 
         _at_least(round(unexplained * count), count, EXPECTED_UNEXPLAINED),
         float((largest >= top).double().mean()),
         tuple(scores),
+        tuple(
+            (row + 1, modes[row])
+            for row in torch.nonzero(used & (weights @ border > 0.5)).flatten().tolist()
+        ),
     )
 
 
-def innovations(
+def _residuals(
     question: Question, fit: Fit
-) -> tuple[Float[Tensor, "m n 3"], Outcome, Float[Tensor, " m"]]:
-    """Innovations of the best particles, how their rows settle (the best one's), and weights."""
+) -> tuple[Float[Tensor, "m n 3"], Float[Tensor, "m n 3"], Outcome, Float[Tensor, " m"]]:
+    """Innovations and parity of the best particles, how their rows settle (the best one's), and
+    weights."""
     order = fit.cloud.weights.argsort(descending=True)[:PARTICLES]
     positions = fit.cloud.positions[order]
     weights = fit.cloud.weights[order] / fit.cloud.weights[order].sum()
@@ -130,47 +147,8 @@ def innovations(
     )
     assert found.whitened is not None and found.steps is not None
     outcome = outcome_of(found.steps, history, setting.used, scene.points_ee)
-    return found.whitened, outcome[:1], weights
-
-
-def parity_score(history: History) -> tuple[float, float]:
-    """Mean parity chi-square for each degree of freedom, and its probability under the noise
-    that is stated; needs no theta."""
-    square = history.merged.chi_square[0][history.read]
-    return float(square.mean()) / 3, _chi_square_p(float(square.sum()), 3 * len(square))
-
-
-def free_space_score(episodes: Sequence[Episode]) -> tuple[float, float, int] | None:
-    """Mean chi-square of pose minus command for each degree of freedom where nothing touches,
-    its probability, and the number of rows; None where too few are sure to be free.
-
-    Needs no theta: rows clear of all that met resistance. Payload, friction of the arm and lag
-    show in it, contact does not.
-    """
-    squares = []
-    for episode in episodes:
-        floored, walled = contact_rows(episode)
-        x, z, _ = episode.poses.T
-        alone = floored & ~walled  # beside the wall, friction pushes up too
-        if not bool(alone.any()):
-            continue
-        free = (z > z[alone].max() + CLEAR) & ~walled
-        if bool(walled.any()):
-            free &= x < x[walled].min() - CLEAR
-        away = episode.poses - episode.commands
-        away = torch.cat((away[:, :2], wrap_angle(away[:, 2:])), dim=-1)
-        free[0] = False  # the command of the start is its pose
-        squares.append((away / episode.sensor_std[:3]).square().sum(-1)[free])
-    square = torch.cat(squares) if squares else torch.zeros(0)
-    if len(square) < FEWEST:
-        return None
-    p = _chi_square_p(float(square.sum()), 3 * len(square))
-    return float(square.mean()) / 3, p, len(square)
-
-
-def _chi_square_p(total: float, freedom: int) -> float:
-    half = torch.tensor(freedom / 2.0, dtype=torch.float64)
-    return float(torch.special.gammaincc(half, torch.tensor(total / 2.0, dtype=torch.float64)))
+    parity = setting.merged.standard_parity(history.read)[0][:, 1:]
+    return found.whitened, parity.expand(len(weights), -1, -1), outcome[:1], weights
 
 
 def _size_score(values: Tensor, weight: Tensor) -> Tensor:

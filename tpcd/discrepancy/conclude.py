@@ -106,6 +106,7 @@ def conclude(
         cells_after=found.after.cells,
         unexplained_before=found.before.unexplained,
         unexplained_after=found.after.unexplained,
+        unexplained_rows=tuple(row for row, _ in found.after.beyond),
         theta_before=theta_estimates(first),
         theta_after=theta_estimates(belief),
         shape=shape,
@@ -148,6 +149,8 @@ def _alternatives(
             f"no motion that tells it from {names}",
             lambda fit=one.fit: deciding_motion(bench.question, found.final, fit, episodes[0]),
         )
+        if motion:
+            bench.tell(f"{names} would explain the data as well; what decides: {motion}")
         told.append(Alternative(one.fit.names, one.gain, motion or "not told"))
     return tuple(told)
 
@@ -194,12 +197,8 @@ def _verdict(
     told = " and ".join(effect.sentence for effect in effects)
     after, level = found.after, bench.settings.level
     if bench.settings.adequacy and not after.adequate(level):
-        where = f"{after.unexplained:.0%} of the transitions are not explained"
-        if after.cells and after.cells_p <= level:
-            cell = after.cells[0]
-            where += f"; most of it in {cell.channel} ({cell.covariate}) while {cell.mode}"
         besides = f"; besides, {told}" if told else ""
-        return "unknown_remains", f"something else is missing: {where}{besides}"
+        return "unknown_remains", f"something else is missing: {after.left(level)}{besides}"
     if not effects:
         return "nothing_missing", _nothing(bench)
     if found.close:

@@ -82,6 +82,14 @@ class Cell:
     count: int
     """Transitions in the cell."""
 
+    @property
+    def words(self) -> str:
+        """What is left there, in words."""
+        what = {"mean": "is off on average", "size": "scatters more than its noise"}
+        how = what.get(self.covariate, f"goes with the {self.covariate}")
+        where = "over all rows" if self.mode == "all" else f"in contact mode '{self.mode}'"
+        return f"{self.channel} {how} {where} ({self.score:+.1f} sd)"
+
 
 @dataclass(frozen=True)
 class Gap:
@@ -161,6 +169,8 @@ class Diagnosis:
     unexplained_before: float = float("nan")
     """Share of transitions that the base model does not explain."""
     unexplained_after: float = float("nan")
+    unexplained_rows: tuple[int, ...] = ()
+    """Rows, counted through all episodes, that the final model does not explain."""
     theta_before: tuple[Estimate, ...] = ()
     theta_after: tuple[Estimate, ...] = ()
     shape: str = ""

@@ -143,9 +143,26 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
             gain = full.log_evidence - current.log_evidence
         by_seed = () if full is None else full.by_seed
         bench.candidates.append(Candidate(g.effect.name, number, gain, by_seed))
+    _tell_gains(bench, current, number)
     if not near:
         return Round(current)
     return _judged(bench, current, near, number)
+
+
+def _tell_gains(bench: Workbench, current: Fit, number: int) -> None:
+    """A line on the candidates of a round: what full fits gain, on each seed, and what the best of
+    the others promises."""
+    tried = sorted((c for c in bench.candidates if c.round == number), key=lambda c: -c.gain)
+    told = []
+    for c in (one for one in tried if one.by_seed):
+        seeds = ", ".join(f"{found - current.log_evidence:+.1f}" for found in c.by_seed)
+        told.append(f"{c.name} {c.gain:+.1f}" + (f" (seeds {seeds})" if len(c.by_seed) > 1 else ""))
+    others = [c for c in tried if not c.by_seed and math.isfinite(c.gain)]
+    if others:
+        rest = "the others promise" if told else "none of the effects promises more than"
+        told.append(f"{rest} {others[0].gain:+.1f}" + (" at most" if told else ""))
+    if told:
+        bench.tell(f"round {number}: gain of log evidence: {'; '.join(told)}")
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

@@ -17,7 +17,7 @@ from tpcd.belief.history import History, joined_history
 from tpcd.belief.prior import make_prior
 from tpcd.belief.settings import EstimatorSettings
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.adequacy import Adequacy, free_space_score, parity_score
+from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.bases import better_base, held_against, is_doubtful
 from tpcd.discrepancy.closeness import carried_on, still_close
 from tpcd.discrepancy.conclude import Findings, conclude
@@ -28,6 +28,7 @@ from tpcd.discrepancy.fit import Fit, Question
 from tpcd.discrepancy.limits import limits_of
 from tpcd.discrepancy.memory import Memory
 from tpcd.discrepancy.naming import find_confusions, name_one
+from tpcd.discrepancy.preflight import free_space_score, parity_score
 from tpcd.discrepancy.pruning import needless, pruned
 from tpcd.discrepancy.rivals import outdone
 from tpcd.discrepancy.settings import FEWEST_ROWS, DiagnosisSettings
@@ -240,11 +241,10 @@ def _explains(bench: Workbench, fit: Fit) -> bool:
 
 def _tell_adequacy(bench: Workbench, what: str, found: Adequacy) -> None:
     """A line on what a model leaves."""
-    word = "explains the data" if found.adequate(bench.settings.level) else "leaves something"
-    top = found.cells[0] if found.cells else None
-    where = (
-        f"; largest: {top.channel} ({top.covariate}) while {top.mode}, {top.score:+.1f} sd"
-        if top
-        else ""
-    )
-    bench.tell(f"{what} {word}: {found.unexplained:.0%} of the transitions unexplained{where}")
+    left = found.left(bench.settings.level)
+    if left:
+        bench.tell(f"{what} leaves something: {left}")
+        return
+    top = f"; at most, {found.cells[0].words}" if found.cells else ""
+    share = f"{found.unexplained:.0%} of the transitions unexplained"
+    bench.tell(f"{what} explains the data: {share}{top}")

@@ -30,15 +30,15 @@ def residual_map(
 
     `rows` are the contact modes with their numbers of transitions, from top to bottom.
     """
-    channels = ("x", "z", "phi")
-    figure, axes = panels(1, 2, 3.9, 0.36 * len(rows) + 1.9)
+    channels = {"x": "x", "z": "z", "phi": "φ", "F_x": "$F_x$", "F_z": "$F_z$", "tau": "τ"}
+    figure, axes = panels(1, 2, 4.6, 0.36 * len(rows) + 1.9)
     labels = [f"{mode} ({count})" for mode, count in rows]
     image = None
     for panel, cells, heading in zip(axes, (before, after), ("before", "after"), strict=True):
         scores = np.full((len(rows), len(channels)), np.nan)
         for mode, channel, score in cells:
             place = [name for name, _ in rows].index(mode)
-            scores[place, channels.index(channel)] = score
+            scores[place, list(channels).index(channel)] = score
         image = panel.imshow(scores, cmap="RdBu_r", vmin=-_LIMIT, vmax=_LIMIT, aspect="auto")
         for (i, j), value in np.ndenumerate(scores):
             if math.isfinite(value):
@@ -47,7 +47,7 @@ def residual_map(
                     j, i, f"{value:+.1f}", ha="center", va="center", fontsize=8,
                     color="white" if dark else "black",
                 )  # fmt: skip
-        panel.set_xticks(range(len(channels)), ["x", "z", "φ"])
+        panel.set_xticks(range(len(channels)), list(channels.values()))
         panel.set_yticks(range(len(rows)), labels if panel is axes[0] else [""] * len(rows))
         panel.grid(False)
         title(panel, heading)

@@ -18,6 +18,7 @@ python -m eval.blind.combine runs/blind runs/more --out runs/all
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,8 @@ def run_blind(config: Blind) -> None:
         strategy = parallel if config.workers > 1 else "auto"
         fabric = Fabric(accelerator="cpu", devices=config.workers, strategy=strategy)
         fabric.launch()
-    fabric.barrier()
-    _run_missing(config, fabric.global_rank, fabric.world_size)
+    missing = fabric.broadcast(_missing(config))
+    _run(config, missing[fabric.global_rank :: fabric.world_size], fabric.global_rank)
     fabric.barrier()
     if fabric.global_rank == 0:
         score(config)
@@ -107,18 +108,23 @@ def cases_of(config: Blind) -> list[Case]:
     return plan(("quick",), 1) if config.quick else plan(config.suites, config.runs)
 
 
-def _run_missing(config: Blind, rank: int, world: int) -> None:
+def _missing(config: Blind) -> list[Case]:
+    """The cases that have no verdict yet."""
+    from eval.blind.trial import read_verdicts
+
+    done = {line["case"] for line in read_verdicts(config.out)[0]}
+    return [case for case in cases_of(config) if case.token(case_seed(config)) not in done]
+
+
+def _run(config: Blind, cases: Sequence[Case], rank: int) -> None:
     """This process's share of the cases."""
     from tqdm import tqdm
 
-    from eval.blind.trial import read_verdicts, run_case
+    from eval.blind.trial import run_case
 
-    seed = case_seed(config)
-    done = {line["case"] for line in read_verdicts(config.out)[0]}
-    mine = [case for case in cases_of(config)[rank::world] if case.token(seed) not in done]
     with append_lines(config.out / f"verdicts-{rank}.jsonl") as lines:
-        for case in tqdm(mine, unit="case", disable=rank > 0):
-            write_line(lines, run_case(case, seed, config.prior, config.out))
+        for case in tqdm(cases, unit="case", disable=rank > 0):
+            write_line(lines, run_case(case, case_seed(config), config.prior, config.out))
 
 
 def score(config: Blind) -> None:

@@ -107,6 +107,7 @@ def test_a_sensor_off_by_the_square_of_the_force_is_left_in_the_wrench_alone() -
     assert pose < abs(found.cells[0].score) / 2
     unheard = left_by_the_truth(episode, parity=False)
     assert {c.channel for c in unheard.cells} == {"x", "z", "phi"}
+    assert unheard.adequate(LEVEL)
 
 
 def test_an_effect_of_the_sensor_takes_away_what_is_left_in_the_wrench() -> None:

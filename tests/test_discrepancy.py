@@ -108,6 +108,19 @@ def test_a_soft_floor_is_named_with_its_size_and_the_gap_shrinks(shape: PolygonS
     )
 
 
+@pytest.mark.slow
+def test_a_sensor_that_is_off_by_the_square_of_the_force_is_not_nothing(
+    shape: PolygonShape, clean: Episode
+) -> None:
+    """No effect that is asked for is of the sensor, and none of the pose is to be named."""
+    wrenches = clean.wrenches.clone()
+    wrenches[:, :2] *= 1 + wrenches[:, :2].abs() / 40
+    found = diagnose([replace(clean, wrenches=wrenches)], shape, SMALL)
+    assert found.verdict == "unknown_remains" and found.names == ()
+    assert "F_x" in found.sentence or "F_z" in found.sentence
+    assert found.cells_after[0].channel in ("F_x", "F_z")
+
+
 def test_an_object_larger_than_any_of_the_prior_is_no_effect(shape: PolygonShape) -> None:
     generator = torch.Generator().manual_seed(6)
     outline = builtin_outlines()["mug"].vertices

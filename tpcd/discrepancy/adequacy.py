@@ -12,6 +12,7 @@ not explain, are counted apart: stick and slip make a few of them under a true m
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -58,6 +59,8 @@ class Adequacy:
     beyond: tuple[tuple[int, str], ...] = ()
     """Rows, counted through all episodes, that lie beyond the border for more than half of the
     posterior, and what they touch."""
+    limit: float = math.inf
+    """The largest score that one in a thousand true models has."""
 
     def adequate(self, level: float) -> bool:
         """Whether nothing departs at this level."""
@@ -75,7 +78,9 @@ class Adequacy:
                 text += f" (rows {', '.join(rows)}{more}; {count} of {len(self.beyond)}: {mode})"
             told.append(text)
         if self.cells and self.cells_p <= level:
-            told.append(self.cells[0].words)
+            # What goes with something says more than that it scatters.
+            clear = (c for c in self.cells if c.covariate != "size" and abs(c.score) > self.limit)
+            told.append(next(clear, self.cells[0]).words)
         return "; ".join(told)
 
 
@@ -124,6 +129,7 @@ def check_adequacy(question: Question, fit: Fit, generator: torch.Generator) -> 
             (row + 1, modes[row])
             for row in torch.nonzero(used & (weights @ border > 0.5)).flatten().tolist()
         ),
+        float(largest.quantile(0.999)),
     )
 
 

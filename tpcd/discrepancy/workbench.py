@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
+from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
@@ -132,7 +133,7 @@ def fitted_again(
     seed: int,
     start: Sequence[Fit],
     question: Question | None = None,
-    places: Tensor | None = None,
+    places: Float[Tensor, "k s"] | None = None,
 ) -> Fit:
     """The fit with one more seed of its model, as for `fit_model`; as it is where that fails."""
     asked = bench.question if question is None else question

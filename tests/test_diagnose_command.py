@@ -140,7 +140,7 @@ def test_a_stopped_run_keeps_its_fits_and_goes_on(
 
 
 def test_what_was_added_later_is_shown_as_it_was_then() -> None:
-    from tpcd.commands.diagnosing import shown_candidates
+    from tpcd.commands.diagnosis_figures import shown_candidates
 
     candidates = (
         Candidate("finer_steps", 0, 40.0),
@@ -157,7 +157,8 @@ def test_what_was_added_later_is_shown_as_it_was_then() -> None:
 def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
-    from tpcd.commands.diagnosing import draw_diagnosis, write_diagnosis
+    from tpcd.commands.diagnosing import write_diagnosis
+    from tpcd.commands.diagnosis_figures import draw_diagnosis
     from tpcd.figures.sinks import save_figure
 
     found = a_diagnosis()

@@ -100,17 +100,13 @@ def compare_runs(folders: Sequence[Path]) -> list[dict[str, Any]]:
             raise RunError(path, "no such file", "give folders that diagnose wrote")
         found = read_json(path)
         try:
-            parameters = [
-                f"{effect['name']}.{p['name']} {p['shown']}"
-                for effect in found["effects"]
-                for p in effect["parameters"]
-            ]
+            effects = [size for effect in found["effects"] for size in _sizes(effect)]
             share = found["share_closed"]
             rows.append(
                 {
                     "run": folder.name,
                     "verdict": found["verdict"].replace("_", " "),
-                    "effects": "; ".join(parameters) or "none",
+                    "effects": "; ".join(effects) or "none",
                     "gap closed": "" if share is None else f"{share:.0%}",
                     "unexplained": _percent(
                         found["unexplained_before"], found["unexplained_after"]
@@ -120,6 +116,13 @@ def compare_runs(folders: Sequence[Path]) -> list[dict[str, Any]]:
         except (KeyError, TypeError, AttributeError) as error:
             raise RunError(path, f"cannot be read ({error!r})", "diagnose again") from error
     return rows
+
+
+def _sizes(effect: dict[str, Any]) -> list[str]:
+    """The parameters of an effect as text, or its name where it has none, as numerics has."""
+    return [f"{effect['name']}.{p['name']} {p['shown']}" for p in effect["parameters"]] or [
+        effect["name"]
+    ]
 
 
 def _percent(before: float | None, after: float | None) -> str:

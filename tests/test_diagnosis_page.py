@@ -51,13 +51,16 @@ def test_the_page_holds_everything_in_one_file(tmp_path: Path) -> None:
             "all channels: 95 % (90 to 99); in typical rows 50 %",
             "needs lift-off",
             "30.0",
+            "120.0 (seeds: 120.1, 119.9) before, 150.0 (seeds: 150.5, 149.2, 150.1) after [nats]",
         ),
         *("floor and wall (7)", "z [mm]", "0.400 (0.300 to 0.500)", "100 % (90 to 100)"),
     ):
         assert text in page
     verdict = json.loads((tmp_path / "verdict.json").read_text())
-    assert set(verdict["evidence"]) == {"before", "after", "candidates"}
-    assert verdict["evidence"]["candidates"][0]["name"] == "floor_compliance"
+    evidence = verdict["evidence"]
+    assert evidence["before_by_seed"] == list(found.log_evidence_base_by_seed)
+    assert evidence["after_by_seed"] == list(found.log_evidence_by_seed)
+    assert evidence["candidates"][0]["name"] == "floor_compliance"
     assert verdict["gap_by_contact"][0]["contact"] == "floor and wall"
     assert "http" not in page.replace("http-equiv", "")
 

@@ -16,6 +16,7 @@ import tpcd
 from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
 from tpcd.commands.diagnosis_figures import draw_diagnosis
+from tpcd.commands.diagnosis_rows import shown_evidence
 from tpcd.commands.gap_rows import shown_gaps, shown_share
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Diagnosis
@@ -143,6 +144,10 @@ def render_page(
         d=diagnosis,
         share=shown_share(diagnosis),
         tables=[shown_gaps(diagnosis.gap), shown_gaps(diagnosis.gap_by_contact, by_contact=True)],
+        evidence=[
+            shown_evidence(diagnosis.log_evidence_base, diagnosis.log_evidence_base_by_seed),
+            shown_evidence(diagnosis.log_evidence, diagnosis.log_evidence_by_seed),
+        ],
         images=images,
         episodes=[str(path) for path in paths if path is not None],
         finite=math.isfinite,

@@ -151,7 +151,10 @@ class Diagnosis:
     alternatives: tuple[Alternative, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     log_evidence_base: float = float("nan")
+    log_evidence_base_by_seed: tuple[float, ...] = ()
+    """The same on each seed; seeds that missed what the best one found do not count in it."""
     log_evidence: float = float("nan")
+    log_evidence_by_seed: tuple[float, ...] = ()
     gap: tuple[Gap, ...] = ()
     gap_by_contact: tuple[Gap, ...] = ()
     share_closed: float = float("nan")
@@ -195,7 +198,13 @@ class Diagnosis:
     def to_plain(self) -> dict[str, Any]:
         """Plain values for `verdict.json`, without the beliefs."""
         parts = {k: v for k, v in vars(self).items() if not k.startswith("belief")}
-        names = {"before": "log_evidence_base", "after": "log_evidence", "candidates": "candidates"}
+        names = {
+            "before": "log_evidence_base",
+            "before_by_seed": "log_evidence_base_by_seed",
+            "after": "log_evidence",
+            "after_by_seed": "log_evidence_by_seed",
+            "candidates": "candidates",
+        }
         evidence = {key: parts.pop(name) for key, name in names.items()}
 
         def plain(value: Any) -> Any:

@@ -7,15 +7,63 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+import torch
 from command_calls import PRIOR
+from diagnosis_bench import SETTINGS, bench_of
 from made_diagnosis import a_diagnosis
 from torch.utils.tensorboard import SummaryWriter
 
+from tpcd.belief.belief import Belief
 from tpcd.commands.diagnosing import compare_runs, write_diagnosis
 from tpcd.commands.diagnosis_figures import draw_diagnosis, shown_candidates
+from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Candidate, Diagnosis, NamedEffect
+from tpcd.discrepancy.evidence import fit_model
+from tpcd.discrepancy.fit import posterior
+from tpcd.discrepancy.report_parts import given_effects, named_effects
 from tpcd.discrepancy.variants import FINER_STEPS
+from tpcd.effects import find_effect
 from tpcd.figures.sinks import save_figure
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.recording import make_motion, record
+from tpcd.truth.scene import draw_scene, make_truth
+
+SAMPLER = replace(SETTINGS.sampler, flat_rounds=0)
+STEPS = 12
+SOFT = {"floor_compliance": {"compliance": 6e-4}}
+
+
+def recorded(hidden: dict[str, dict[str, float]], path: Path) -> Episode:
+    """A mug that presses on a floor, and slides."""
+    generator = torch.Generator().manual_seed(5)
+    scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)
+    motion = make_motion("diagnosis", scene, STEPS, generator)
+    truth = make_truth(scene, "quasistatic", hidden, STEPS)
+    return replace(record(truth, scene, motion, STEPS, generator).measured, path=path)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> tuple[Episode, Episode]:
+    """On a rigid floor, then on a soft one."""
+    return recorded({}, Path("rigid.csv")), recorded(SOFT, Path("soft.csv"))
+
+
+def learnt(episode: Episode, *names: str) -> Belief:
+    """What an episode tells under a model with these effects."""
+    question = replace(bench_of(episode).question, sampler=SAMPLER)
+    effects = tuple(find_effect(name) for name in names)
+    return posterior(question, fit_model(question, effects, (0,)))
+
+
+@pytest.fixture(scope="module")
+def before(episodes: tuple[Episode, Episode]) -> Belief:
+    return learnt(episodes[0], "floor_tilt")
+
+
+@pytest.fixture(scope="module")
+def after(episodes: tuple[Episode, Episode]) -> Belief:
+    return learnt(episodes[1], "floor_tilt", "floor_compliance")
 
 
 def written(found: Diagnosis, folder: Path) -> str:
@@ -73,3 +121,19 @@ def test_an_effect_without_parameters_is_shown_by_its_name(tmp_path: Path) -> No
     (row,) = compare_runs([tmp_path])
     shown = effects[1].parameters[0].shown
     assert row["effects"] == f"numerics; floor_compliance.compliance {shown}"
+
+
+def test_effects_that_were_given_are_told_apart_from_those_found(
+    after: Belief, tmp_path: Path
+) -> None:
+    effects, given = named_effects(after, 1), given_effects(after, 1)
+    page = written(replace(a_diagnosis(), effects=effects, given=given), tmp_path)
+    verdict = json.loads((tmp_path / "verdict.json").read_text())
+    for key, name in (("given", "floor_tilt"), ("effects", "floor_compliance")):
+        (effect,) = verdict[key]
+        assert effect["name"] == name
+        place = after.prior.names.index(f"{name}.{effect['parameters'][0]['name']}")
+        assert effect["parameters"][0]["value"] == pytest.approx(float(after.mean()[place]))
+        assert effect["parameters"][0]["shown"] in page
+    heading = "Effects that the model had from the start"
+    assert heading in page and heading not in written(a_diagnosis(), tmp_path)

@@ -16,7 +16,7 @@ from tpcd.discrepancy.fit import Fit, Question, joined_fit, posterior
 from tpcd.discrepancy.gaps import Errors, Gaps, gaps, typical_share
 from tpcd.discrepancy.heldout import held_out_errors, prediction_errors
 from tpcd.discrepancy.limits import limits_of
-from tpcd.discrepancy.report_parts import named_effects, theta_estimates
+from tpcd.discrepancy.report_parts import given_effects, named_effects, theta_estimates
 from tpcd.discrepancy.settings import ENOUGH_DRAWS, FEWEST_DRAWS, REPORTED_SEEDS
 from tpcd.discrepancy.variants import NUMERICS, Variant
 from tpcd.discrepancy.workbench import Close, Workbench
@@ -91,6 +91,7 @@ def conclude(
         verdict=verdict,
         sentence=sentence,
         effects=effects,
+        given=given_effects(belief, bench.given),
         alternatives=_alternatives(bench, found, episodes) if effects else (),
         candidates=tuple(bench.candidates),
         log_evidence_base=found.given.log_evidence,

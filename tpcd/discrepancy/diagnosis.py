@@ -148,6 +148,8 @@ class Diagnosis:
     verdict: Verdict
     sentence: str
     effects: tuple[NamedEffect, ...] = ()
+    given: tuple[NamedEffect, ...] = ()
+    """Effects that the model had from the start, with the sizes that these data give them."""
     alternatives: tuple[Alternative, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     log_evidence_base: float = float("nan")

@@ -17,18 +17,12 @@ SIZES = ("object_width", "object_height")
 
 def named_effects(belief: Belief, given: int) -> tuple[NamedEffect, ...]:
     """The effects of a belief with their sizes, but for the first ones that were given."""
-    entries = estimates(belief)
-    place = belief.prior.scene_dimension
-    found = []
-    for k, effect in enumerate(belief.prior.effects):
-        own = []
-        for parameter in effect.parameters:
-            own.append(_shown(entries[place], parameter))
-            place += 1
-        if k >= given:
-            sentence = effect.sentence([estimate.shown for estimate in own])
-            found.append(NamedEffect(effect.name, tuple(own), sentence))
-    return tuple(found)
+    return _sized_effects(belief)[given:]
+
+
+def given_effects(belief: Belief, given: int) -> tuple[NamedEffect, ...]:
+    """The first effects of a belief, which were given, with the sizes that these data give them."""
+    return _sized_effects(belief)[:given]
 
 
 def theta_estimates(belief: Belief) -> tuple[Estimate, ...]:
@@ -82,6 +76,17 @@ def with_unit(text: str, parameter: EffectParameter) -> str:
     """A number as text with the unit in which people read it, which a mere number has not."""
     unit = parameter.shown_unit or parameter.unit
     return text if unit == "1" else f"{text} {unit}"
+
+
+def _sized_effects(belief: Belief) -> tuple[NamedEffect, ...]:
+    """All effects of a belief with their sizes."""
+    entries = iter(estimates(belief)[belief.prior.scene_dimension :])
+    found = []
+    for effect in belief.prior.effects:
+        own = tuple(_shown(next(entries), parameter) for parameter in effect.parameters)
+        sentence = effect.sentence([estimate.shown for estimate in own])
+        found.append(NamedEffect(effect.name, own, sentence))
+    return tuple(found)
 
 
 def _shown(estimate: Estimate, parameter: EffectParameter) -> Estimate:

@@ -53,4 +53,5 @@ def a_diagnosis() -> Diagnosis:
         theta_after=(Estimate("friction", 0.32, 0.02, 0.29, 0.35, "1"),),
         detection_limits=(Limit("adhesion", "force", math.inf, "none", "needs lift-off"),),
         coverage=dict.fromkeys(NEEDED, 1.0),
+        tests={"parity": 1.44, "parity_p": 1e-4, "free_space": 0.81, "free_space_p": 0.6},
     )

@@ -17,7 +17,9 @@ from torch.utils.tensorboard import SummaryWriter
 from tpcd.belief.belief import Belief
 from tpcd.commands.diagnosing import compare_runs, write_diagnosis
 from tpcd.commands.diagnosis_figures import draw_diagnosis, shown_candidates
+from tpcd.commands.diagnosis_rows import shown_coverage, shown_tests
 from tpcd.data.episode import Episode
+from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
 from tpcd.discrepancy.diagnosis import Candidate, Diagnosis, NamedEffect
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import posterior
@@ -137,3 +139,31 @@ def test_effects_that_were_given_are_told_apart_from_those_found(
         assert effect["parameters"][0]["shown"] in page
     heading = "Effects that the model had from the start"
     assert heading in page and heading not in written(a_diagnosis(), tmp_path)
+
+
+def test_tests_without_theta_are_told_in_units_of_the_noise(tmp_path: Path) -> None:
+    found = a_diagnosis()
+    page = written(found, tmp_path)
+    parity, free = shown_tests(found.tests)
+    for row, name in ((parity, "parity"), (free, "free_space")):
+        assert float(row["times the noise"]) ** 2 == pytest.approx(found.tests[name], rel=0.01)
+        assert float(row["p under noise alone"]) == found.tests[f"{name}_p"]
+        assert all(text in page for text in row.values())
+    # Where too few rows are free there is one test, and before a fit none.
+    assert shown_tests({"parity": 1.0, "parity_p": 1.0})[0]["test"] == parity["test"]
+    assert shown_tests({}) == []
+
+
+def test_what_the_motions_excite_is_told_with_what_is_lacking(
+    episodes: tuple[Episode, Episode], tmp_path: Path
+) -> None:
+    coverage = coverage_of(episodes)
+    rows = shown_coverage(coverage.counts)
+    assert [row["excitation"] for row in rows] == list(NEEDED)
+    lacking = [row["excitation"] for row in rows if row[""]]
+    assert lacking == coverage.missing(list(NEEDED)) and 0 < len(lacking) < len(rows)
+    page = written(replace(a_diagnosis(), coverage=coverage.counts), tmp_path)
+    assert all(MOTIONS[need] in page for need in lacking)
+    apart = 1e3 * coverage.counts["floor places"]
+    assert any(row["there is"] == f"{apart:.0f} mm apart" for row in rows)
+    assert "What the motions excite" not in written(Diagnosis("named", ""), tmp_path)

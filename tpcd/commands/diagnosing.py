@@ -16,7 +16,7 @@ import tpcd
 from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
 from tpcd.commands.diagnosis_figures import draw_diagnosis
-from tpcd.commands.diagnosis_rows import shown_evidence
+from tpcd.commands.diagnosis_rows import shown_coverage, shown_evidence, shown_tests
 from tpcd.commands.gap_rows import shown_gaps, shown_share
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Diagnosis
@@ -148,6 +148,8 @@ def render_page(
             shown_evidence(diagnosis.log_evidence_base, diagnosis.log_evidence_base_by_seed),
             shown_evidence(diagnosis.log_evidence, diagnosis.log_evidence_by_seed),
         ],
+        tests=shown_tests(diagnosis.tests),
+        coverage=shown_coverage(diagnosis.coverage),
         images=images,
         episodes=[str(path) for path in paths if path is not None],
         finite=math.isfinite,

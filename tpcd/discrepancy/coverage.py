@@ -39,6 +39,13 @@ NEEDED: dict[str, float] = {
 }
 """How much of each excitation is needed: rows, the ratio of largest to smallest load, or how
 far apart the places are [m]."""
+UNITS: dict[str, str] = dict.fromkeys(NEEDED, "rows") | {
+    "floor loads": "1",
+    "floor places": "m",
+    "wall loads": "1",
+    "wall places": "m",
+}
+"""What each excitation is counted in: rows, 1 for a ratio, m for a distance."""
 MOTIONS: dict[str, str] = {
     "free motion": "move 20 mm or more in free space, both ways on each axis",
     "pause": "command the same pose twice",
@@ -72,9 +79,11 @@ class Coverage:
 def coverage_of(episodes: Sequence[Episode]) -> Coverage:
     """What the episodes excite together; each is one run of its own."""
     found = [_of_one(episode) for episode in episodes]
-    spans = ("floor loads", "wall loads", "floor places", "wall places")
     return Coverage(
-        {need: (max if need in spans else sum)(one[need] for one in found) for need in NEEDED}
+        {
+            need: (sum if UNITS[need] == "rows" else max)(one[need] for one in found)
+            for need in NEEDED
+        }
     )
 
 

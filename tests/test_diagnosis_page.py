@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from dataclasses import replace
@@ -12,9 +13,11 @@ import torch
 from command_calls import PRIOR
 from diagnosis_bench import SETTINGS, bench_of
 from made_diagnosis import a_diagnosis
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.tensorboard import SummaryWriter
 
 from tpcd.belief.belief import Belief
+from tpcd.belief.storage import load_belief
 from tpcd.commands.diagnosing import compare_runs, write_diagnosis
 from tpcd.commands.diagnosis_figures import draw_diagnosis, shown_candidates
 from tpcd.commands.diagnosis_rows import shown_coverage, shown_tests
@@ -23,9 +26,10 @@ from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
 from tpcd.discrepancy.diagnosis import Candidate, Diagnosis, NamedEffect
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import posterior
-from tpcd.discrepancy.report_parts import given_effects, named_effects
+from tpcd.discrepancy.report_parts import given_effects, named_effects, theta_estimates
 from tpcd.discrepancy.variants import FINER_STEPS
 from tpcd.effects import find_effect
+from tpcd.effects.model import load_model
 from tpcd.figures.sinks import save_figure
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.truth.recording import make_motion, record
@@ -167,3 +171,47 @@ def test_what_the_motions_excite_is_told_with_what_is_lacking(
     apart = 1e3 * coverage.counts["floor places"]
     assert any(row["there is"] == f"{apart:.0f} mm apart" for row in rows)
     assert "What the motions excite" not in written(Diagnosis("named", ""), tmp_path)
+
+
+def test_all_of_a_diagnosis_with_a_posterior_is_written_and_read_again(
+    episodes: tuple[Episode, Episode], before: Belief, after: Belief, tmp_path: Path
+) -> None:
+    found = replace(
+        a_diagnosis(),
+        gap=(),
+        effects=named_effects(after, 1),
+        given=given_effects(after, 1),
+        theta_before=theta_estimates(before),
+        theta_after=theta_estimates(after),
+        belief_before=before,
+        belief=after,
+    )
+    with SummaryWriter(tmp_path / "tensorboard") as writer:
+        page = write_diagnosis(found, episodes, 6.0, PRIOR, tmp_path, writer).read_text()
+    figures = {path.stem: path for path in (tmp_path / "figures").iterdir()}
+    # What moved is drawn though no gap could be told; the soft floor is what the base has wrong.
+    assert set(figures) == {"residuals", "evidence", "theta", "stretch"}
+    for path in figures.values():
+        assert base64.b64encode(path.read_bytes()).decode() in page
+    assert f"The {STEPS} rows in a row of soft.csv that the base model predicts worst." in page
+    assert str(episodes[0].path) in page
+    model = load_model(tmp_path / "model.yaml")
+    assert model.effects == after.prior.effects and model.step == after.step
+    for name, value in zip(after.prior.names, after.mean().tolist(), strict=True):
+        effect, _, parameter = name.partition(".")
+        if parameter:
+            assert model.found[effect][parameter][0] == pytest.approx(value)
+    again = load_belief(tmp_path, after.prior.shape)
+    assert torch.equal(again.vectors, after.vectors) and torch.equal(again.weights, after.weights)
+    log = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert set(log.Tags()["images"]) == {f"diagnosis/{name}" for name in figures}
+    (text,) = log.Tensors("verdict/text_summary")
+    assert found.sentence in text.tensor_proto.string_val[0].decode()
+
+
+def test_what_did_not_change_is_not_drawn(
+    episodes: tuple[Episode, Episode], before: Belief
+) -> None:
+    theta = theta_estimates(before)
+    same = Diagnosis("nothing_missing", "", theta_before=theta, theta_after=theta)
+    assert draw_diagnosis(replace(same, belief=before, belief_before=before), episodes, 6.0) == {}

@@ -6,15 +6,23 @@ import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from matplotlib.figure import Figure
+from torch import Tensor
 
+from tpcd.belief.belief import Belief
+from tpcd.commands.prediction import measured_rows, prediction_error
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Candidate, Cell, Diagnosis
 from tpcd.figures.diagnosis import evidence_bars, gap_bars, residual_map, theta_shift, worst_stretch
 from tpcd.predict import ContactPredictor
+from tpcd.prediction import CHANNELS
 
 STRETCH = 20
 """Rows of the worst stretch."""
+STRETCH_CHANNELS = ("z", "F_x", "F_z", "tau")
+PARTICLES = 100
+"""Particles that predict it."""
 
 
 def draw_diagnosis(
@@ -59,6 +67,7 @@ def draw_diagnosis(
             gap_bars(bars),
             f"Errors of one-step predictions on {diagnosis.held_out}, with 90 % intervals.",
         )
+    if diagnosis.theta_before and diagnosis.theta_after != diagnosis.theta_before:
         drawn["theta"] = (
             theta_shift(
                 [e.name for e in diagnosis.theta_after],
@@ -67,11 +76,9 @@ def draw_diagnosis(
             ),
             "What the base model held for true, against the model found.",
         )
-    if diagnosis.belief is not None and diagnosis.belief_before is not None and diagnosis.effects:
-        drawn["stretch"] = (
-            _stretch(diagnosis, episodes[0]),
-            f"The {STRETCH} rows in a row that the base model predicts worst.",
-        )
+    before, after = diagnosis.belief_before, diagnosis.belief
+    if before is not None and after is not None and after is not before:
+        drawn["stretch"] = _stretch(before, after, episodes)
     return drawn
 
 
@@ -95,21 +102,37 @@ def _largest_scores(cells: Sequence[Cell]) -> list[tuple[str, str, float]]:
     return [(*key, score) for key, score in largest.items()]
 
 
-def _stretch(diagnosis: Diagnosis, episode: Episode) -> Figure:
-    predicted = []
-    for belief in (diagnosis.belief_before, diagnosis.belief):
-        assert belief is not None
-        found = ContactPredictor(belief, particles=100).predict(
-            episode.poses[:-1], episode.commands[1:], episode.commands[:-1]
-        )
-        predicted.append(found.mean)
-    measured = torch.cat((episode.poses, episode.wrenches), dim=-1)[1:]
-    square = ((predicted[0] - measured) / episode.sensor_std).square().nan_to_num(0.0).sum(-1)
-    length = min(STRETCH, len(square))
-    first = int(square.unfold(0, length, 1).sum(-1).argmax())
-    part, channels = slice(first, first + length), [1, 3, 4]
-    return worst_stretch(
-        (torch.arange(len(measured)) + 1)[part].numpy(),
-        *(value[part][:, channels].numpy() for value in (measured, *predicted)),
+def _stretch(before: Belief, after: Belief, episodes: Sequence[Episode]) -> tuple[Figure, str]:
+    """The rows in a row of all episodes that the base model predicts worst, and the caption."""
+    places = [(*_worst_rows(before, episode), k) for k, episode in enumerate(episodes)]
+    _, part, k = max(places, key=lambda place: place[0])
+    episode = episodes[k]
+    channels = [CHANNELS.index(name) for name in STRETCH_CHANNELS]
+    values = (measured_rows(episode)[1:], *(_predicted(b, episode) for b in (before, after)))
+    figure = worst_stretch(
+        torch.arange(1, len(episode))[part].numpy(),
+        *(value[part][:, channels].numpy() for value in values),
         episode.sensor_std[channels].numpy(),
+    )
+    where = f" of {episode.path.name}" if episode.path else ""
+    count = part.stop - part.start
+    return figure, f"The {count} rows in a row{where} that the base model predicts worst."
+
+
+def _worst_rows(belief: Belief, episode: Episode) -> tuple[float, slice]:
+    """The rows in a row that a belief predicts worst, and how badly, in squares of the noise."""
+    off = prediction_error(measured_rows(episode)[1:], _predicted(belief, episode))
+    square = (off / episode.sensor_std).square().nan_to_num(0.0).sum(-1)
+    length = min(STRETCH, len(square))
+    sums = square.unfold(0, length, 1).sum(-1)
+    first = int(sums.argmax())
+    return float(sums[first]), slice(first, first + length)
+
+
+def _predicted(belief: Belief, episode: Episode) -> Float[Tensor, "n 6"]:
+    """Pose and wrench of every row but the first, each foreseen from the row before."""
+    return (
+        ContactPredictor(belief, PARTICLES)
+        .predict(episode.poses[:-1], episode.commands[1:], episode.commands[:-1])
+        .mean
     )

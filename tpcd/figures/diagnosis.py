@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from tpcd.figures.style import SERIES, TRUTH, display_unit, legend_below, panels, title
 
@@ -52,7 +53,7 @@ def residual_map(
         panel.grid(False)
         title(panel, heading)
     assert image is not None
-    figure.colorbar(image, ax=axes, label="largest score [standard deviations]", shrink=0.9)
+    figure.colorbar(image, ax=axes, label="largest score [sd]", shrink=0.9)
     return figure
 
 
@@ -110,12 +111,12 @@ def gap_bars(bars: Sequence[tuple[str, str, Interval, Interval, float]]) -> Figu
 def worst_stretch(
     rows: np.ndarray, measured: np.ndarray, before: np.ndarray, after: np.ndarray, noise: np.ndarray
 ) -> Figure:
-    """Prediction errors of the height and measured against predicted forces over n rows.
+    """Prediction errors of the height and measured against predicted wrenches over n rows.
 
-    Values (n, 3) of z [m], F_x [N] and F_z [N], and the noise (3) of each.
+    Values (n, 4) of z [m], F_x [N], F_z [N] and tau [N·m], and the noise (4) of each.
     """
-    names, units = ("error of z", "F_x", "F_z"), ("m", "N", "N")
-    figure, axes = panels(3, 1, 6.4, 1.8, share_x=True)
+    names, units = ("error of z", "$F_x$", "$F_z$", "τ"), ("m", "N", "N", "N·m")
+    figure, axes = panels(4, 1, 6.4, 1.5, share_x=True)
     for k, panel in enumerate(axes):
         factor, unit = display_unit(units[k])
         # Heights differ by far more than their errors.
@@ -131,10 +132,11 @@ def worst_stretch(
                 rows, factor * (values[:, k] - zero), color=colour, marker=marker, linewidth=0
             )
         panel.set_ylabel(f"{names[k]} [{unit}]")
+    figure.align_ylabels(axes)
     axes[-1].set_xlabel("row")
     axes[-1].locator_params(axis="x", integer=True)
     entries = {
-        "measured, ± 2 sd of the noise": Line2D([], [], color=TRUTH),
+        "measured, ± 2 sd of the noise": (Patch(color="0.85"), Line2D([], [], color=TRUTH)),
         "predicted before": Line2D([], [], color=BEFORE, marker="o", linewidth=0),
         "predicted after": Line2D([], [], color=AFTER, marker=".", linewidth=0),
     }

@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
-from command_calls import PRIOR
+from command_calls import PRIOR, ROOT
 from diagnosis_bench import SETTINGS, bench_of
 from made_diagnosis import a_diagnosis
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -18,12 +20,12 @@ from torch.utils.tensorboard import SummaryWriter
 
 from tpcd.belief.belief import Belief
 from tpcd.belief.storage import load_belief
-from tpcd.commands.diagnosing import compare_runs, write_diagnosis
+from tpcd.commands.diagnosing import EXIT_CODES, compare_runs, write_diagnosis
 from tpcd.commands.diagnosis_figures import draw_diagnosis, shown_candidates
 from tpcd.commands.diagnosis_rows import shown_coverage, shown_tests
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
-from tpcd.discrepancy.diagnosis import Candidate, Diagnosis, NamedEffect
+from tpcd.discrepancy.diagnosis import Candidate, Diagnosis, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import posterior
 from tpcd.discrepancy.report_parts import given_effects, named_effects, theta_estimates
@@ -35,6 +37,7 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
+DOCS = (ROOT / "tpcd" / "discrepancy" / "README.md").read_text(encoding="utf-8")
 SAMPLER = replace(SETTINGS.sampler, flat_rounds=0)
 STEPS = 12
 SOFT = {"floor_compliance": {"compliance": 6e-4}}
@@ -215,3 +218,30 @@ def test_what_did_not_change_is_not_drawn(
     theta = theta_estimates(before)
     same = Diagnosis("nothing_missing", "", theta_before=theta, theta_after=theta)
     assert draw_diagnosis(replace(same, belief=before, belief_before=before), episodes, 6.0) == {}
+
+
+def test_the_docs_tell_every_key_and_every_exit_code(tmp_path: Path) -> None:
+    written(a_diagnosis(), tmp_path)
+    verdict = json.loads((tmp_path / "verdict.json").read_text())
+    assert "candidates" in verdict["evidence"] and "non_finite" in verdict
+    told = [row.split("|")[1:3] for row in DOCS.splitlines() if row.startswith("| `")]
+    keys = {key for names, _ in told for key in re.findall(r"`(\w+)`", names)}
+    assert set(verdict) <= keys
+    assert set(verdict["evidence"]) <= set(re.findall(r"`(\w+)`", DOCS))
+    codes = {names.strip(" `"): int(code) for names, code in told if code.strip().isdigit()}
+    assert codes == EXIT_CODES and set(codes) == set(get_args(Verdict))
+
+
+def test_runs_of_before_are_put_side_by_side_with_those_of_today(tmp_path: Path) -> None:
+    found = replace(a_diagnosis(), given=a_diagnosis().effects)
+    for name in ("old", "new"):
+        written(found, tmp_path / name)
+    path = tmp_path / "old" / "verdict.json"
+    verdict = json.loads(path.read_text())
+    for key in ("given", "tests", "coverage", "seconds", "non_finite"):
+        del verdict[key]
+    for key in ("before_by_seed", "after_by_seed"):
+        del verdict["evidence"][key]
+    path.write_text(json.dumps(verdict))
+    old, new = compare_runs([tmp_path / "old", tmp_path / "new"])
+    assert old == {**new, "run": "old"}

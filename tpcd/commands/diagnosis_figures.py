@@ -42,7 +42,8 @@ def draw_diagnosis(
                 sorted(rows.items(), key=lambda row: (row[0] != "all", row[0])),
             ),
             "What the models leave, by contact mode (number of transitions) and channel: the"
-            " largest score of residuals' mean, size, or slope with load, place, angle or time.",
+            " largest score of residuals' mean, size, or slope with load, place, angle or time."
+            " Forces and torque: what the wrench says beyond the pose.",
         )
     tried = shown_candidates(diagnosis)
     if tried:

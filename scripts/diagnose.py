@@ -69,7 +69,8 @@ def diagnose_episodes(config: Diagnose) -> int:
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
     from tpcd.effects.formula import FORMULAS
-    from tpcd.effects.model import Model, load_candidates, load_model
+    from tpcd.effects.model import Model, load_model
+    from tpcd.effects.own import load_candidates
     from tpcd.results import format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 

@@ -20,7 +20,8 @@ from tpcd.data.episode import Episode
 from tpcd.data.files import write_episode
 from tpcd.effects import CATALOGUE, KNOWN, Effect
 from tpcd.effects.check import check_effect
-from tpcd.effects.model import Model, load_effects, load_model, write_model
+from tpcd.effects.model import Model, load_model, write_model
+from tpcd.effects.own import load_effects
 from tpcd.effects.protocol import Added
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.errors import ModelError

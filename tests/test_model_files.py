@@ -8,7 +8,8 @@ import pytest
 from effect_cases import block, one_line
 
 from tpcd.effects import CATALOGUE
-from tpcd.effects.model import Model, load_candidates, load_effects, load_model, write_model
+from tpcd.effects.model import Model, load_model, write_model
+from tpcd.effects.own import load_candidates, load_effects
 from tpcd.errors import ModelError
 from tpcd.files import to_plain
 

@@ -138,7 +138,7 @@ def _rows(
     ]
     model, found = _found(config, recorded, folder)
     if model is not None and model.effects:
-        settings = EstimatorSettings(step=model.step, effects=model.informed)
+        settings = EstimatorSettings(step=model.step, effects=model.informed, shape=model.shape)
         added = Estimator(shape, settings=settings).learn(expert, stream(config.seed, 8))
         row = _row(name, tiles, "ours, gap found", added.belief, test)
         rows.append({**row, "found": found})

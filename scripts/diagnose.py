@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tpcd.cli import check_numbers, run
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tpcd.data.episode import Episode
+    from tpcd.effects.shape_change import ShapeChange
+    from tpcd.shape.deepsdf import DeepSDFShape
 
 USUAL_OUT = Path("runs/diagnosis")
 
@@ -56,6 +64,7 @@ def diagnose_episodes(config: Diagnose) -> int:
     import torch
     from torch.utils.tensorboard import SummaryWriter
 
+    from tpcd.belief.augmented import shape_change_of
     from tpcd.commands.diagnosing import (
         EXIT_CODES,
         compare_runs,
@@ -71,6 +80,7 @@ def diagnose_episodes(config: Diagnose) -> int:
     from tpcd.effects.formula import FORMULAS
     from tpcd.effects.model import Model, load_model
     from tpcd.effects.own import load_candidates
+    from tpcd.effects.shape_change import UNCHANGED
     from tpcd.results import format_table, run_folder, write_results
     from tpcd.shape.checkpoint import load_prior
 
@@ -89,6 +99,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         print(f"note: {note}")
     shape = load_prior(config.prior)
     model = Model() if config.model is None else load_model(config.model)
+    given, expected = _with_shape(data.episodes, shape, model.shape)
     settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
     own = load_candidates(config.candidates, (*settings.catalogue, *FORMULAS))
     settings = replace(settings, catalogue=(*settings.catalogue, *own))
@@ -101,19 +112,23 @@ def diagnose_episodes(config: Diagnose) -> int:
             with WorkLine() as line:
                 memory = replace(fits_of(folder, files), watch=line.begin)
                 found = diagnose(
-                    data.episodes, shape, settings, data.fresh, model.effects, line.tell, memory
+                    given, expected, settings, data.fresh, model.effects, line.tell, memory
                 )
         found = replace(found, notes=(*data.notes, *found.notes))
         if found.gap:
             print(f"\none-step errors on {found.held_out}, with 90 % intervals")
             print(format_table(shown_gaps(found.gap)))
             print(f"closed of the excess over the noise, all channels: {shown_share(found)}")
+        change = UNCHANGED
+        if found.belief is not None:
+            change = shape_change_of(found.belief, shape, data.episodes[0].priors)
         with SummaryWriter(folder / "tensorboard") as writer:
-            write_diagnosis(found, data.episodes, settings.least_gain, config.prior, folder, writer)
+            gain = settings.least_gain
+            write_diagnosis(found, data.episodes, gain, config.prior, folder, writer, change)
         write_results(folder, [vars(gap) for gap in found.gap], seeds=[config.seed])
         forget_fits(folder)
     print(f"\nreport in {config.out}/report.html, verdict in {config.out}/verdict.json", end="")
-    if found.effects:
+    if found.effects or change != UNCHANGED:
         print(
             f"; next: python scripts/estimate.py EPISODE --prior {quote(str(config.prior))}"
             f" --model {quote(str(config.out / 'model.yaml'))} --out RUN",
@@ -121,6 +136,20 @@ def diagnose_episodes(config: Diagnose) -> int:
         )
     print()
     return EXIT_CODES[found.verdict]
+
+
+def _with_shape(
+    episodes: Sequence[Episode], shape: DeepSDFShape, change: ShapeChange
+) -> tuple[list[Episode], DeepSDFShape]:
+    """Episodes and shape prior that expect what a model says of the object."""
+    from dataclasses import replace
+
+    from tpcd.belief.belief import misfit_field
+    from tpcd.belief.settings import EstimatorSettings
+
+    sd = misfit_field(shape, EstimatorSettings(shape=change)).sd
+    wide = replace(shape, misfit=replace(shape.misfit, sd=sd))
+    return [replace(one, priors=change.bounds(one.priors)) for one in episodes], wide
 
 
 if __name__ == "__main__":

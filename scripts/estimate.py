@@ -26,7 +26,8 @@ class Estimate:
     particles: int = 700
     """Particles of the belief (the filter `paper` has its own number)."""
     misfit: float | None = None
-    """Median of the outline error's standard deviation [m]; by default the prior's own figure."""
+    """Median of the outline error's standard deviation [m]; by default the prior's own figure, or
+    as many times that as --model says."""
     seed: int = 0
     """Seed of all random numbers."""
     resume: bool = False
@@ -76,7 +77,7 @@ def estimate_episode(config: Estimate) -> None:
     model = model_of(config.model)
     shape = load_prior(config.prior)
     check_units(episode)
-    check_start_pose(episode, shape)
+    check_start_pose(episode, shape, model.shape)
     for warning in check_episode(episode):
         print(f"warning: {warning}", file=sys.stderr)
     if config.resume:
@@ -98,6 +99,7 @@ def estimate_episode(config: Estimate) -> None:
             step=model.step,
             misfit_sd=config.misfit,
             effects=model.informed,
+            shape=model.shape,
         )
         estimator = Estimator(shape, config.estimator, settings)
         steps = estimator.steps(episode, torch.Generator().manual_seed(config.seed), state)

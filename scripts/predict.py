@@ -58,6 +58,7 @@ def predict_episodes(config: Predict) -> None:
     )
     from tpcd.data import read_episode
     from tpcd.data.files import TABLE_SUFFIXES
+    from tpcd.effects.shape_change import UNCHANGED
     from tpcd.errors import RunError
     from tpcd.predict import ContactPredictor
     from tpcd.results import format_table
@@ -93,6 +94,8 @@ def predict_episodes(config: Predict) -> None:
         for effect in model.effects:
             source = "what was found" if effect.name in model.found else "its prior"
             print(f"{effect.name} is drawn from {source} in {config.model}")
+        if model.shape != UNCHANGED:
+            print(f"the belief keeps its shape; the one in {config.model} is for estimates")
     predictor = ContactPredictor(belief, config.particles)
     predicted: list[PredictedRows] = []
     known = config.of == "true" and all(map(has_truth, read))

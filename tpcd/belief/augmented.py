@@ -14,9 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.belief import Belief
+from tpcd.belief.belief import Belief, misfit_field
+from tpcd.belief.prior import make_prior
+from tpcd.belief.settings import EstimatorSettings
 from tpcd.effects.model import Found, Model
 from tpcd.effects.protocol import Effect
+from tpcd.effects.shape_change import Bounds, ShapeChange
+from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
 
@@ -32,13 +36,23 @@ def found_effects(belief: Belief) -> Found:
     return found
 
 
+def shape_change_of(belief: Belief, shape: Shape, priors: Bounds) -> ShapeChange:
+    """What the belief expects of the object otherwise than the shape model does on episodes with
+    these priors."""
+    usual = make_prior(shape, priors)
+    place = usual.names.index("scale")
+    own, other = ((p.low[place].item(), p.high[place].item()) for p in (belief.prior, usual))
+    times = belief.misfit.sd / misfit_field(shape, EstimatorSettings()).sd
+    return ShapeChange(None if own == other else own, times)
+
+
 def with_model(belief: Belief, model: Model, generator: torch.Generator) -> Belief:
     """The belief with the effects of a model besides its own, drawn anew for each particle.
 
     Parameters are drawn independently, from the normal distribution that the model file says was
     found, within their prior; from the prior where it says nothing. Settings of the step that are
-    not the default replace those of the belief. Raises ValueError for an effect that the belief
-    has already.
+    not the default replace those of the belief; its shape stays. Raises ValueError for an effect
+    that the belief has already.
     """
     own = [effect.name for effect in belief.prior.effects]
     twice = [effect.name for effect in model.effects if effect.name in own]

@@ -145,7 +145,7 @@ def estimate(
 
 def target_of(episode: Episode, shape: Shape, settings: EstimatorSettings) -> ContactTarget:
     """The posterior to sample from, still without data."""
-    prior = make_prior(shape, episode.priors, settings.effects)
+    prior = make_prior(shape, settings.shape.bounds(episode.priors), settings.effects)
     field, power = misfit_field(shape, settings), settings.likelihood_power
     return ContactTarget(prior, field, settings.step, power=power)
 
@@ -194,13 +194,14 @@ def prior_belief(
 def misfit_field(shape: Shape, settings: EstimatorSettings) -> MisfitField:
     """The misfit field that belongs to a shape model."""
     own, sd, spread = shape.misfit, settings.misfit_sd, settings.misfit_spread
+    factor = settings.shape.misfit if sd is None else 1.0
     if spread is None:
         measured = own.spread if sd is None else 0.0
         spread = max(measured, settings.least_misfit_spread)
     if sd is None:
         sd = own.sd
     return MisfitField(
-        sd=max(sd, settings.least_misfit_sd),
+        sd=factor * max(sd, settings.least_misfit_sd),
         spread=spread,
         width=own.width,
         grain=own.grain,

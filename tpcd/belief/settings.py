@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from tpcd.effects.protocol import Effect
+from tpcd.effects.shape_change import UNCHANGED, ShapeChange
 from tpcd.simulator import StepSettings
 from tpcd.simulator.native import available
 
@@ -154,6 +155,9 @@ class EstimatorSettings:
     """Some objects are like none that the spread was measured on."""
     least_misfit_sd: float = 1e-4
     """The median is never taken to be less than this [m]."""
+    shape: ShapeChange = UNCHANGED
+    """What is expected of the object besides what the shape model says; a given `misfit_sd` is
+    taken as it is."""
     effects: tuple[Effect, ...] = ()
     """Effects that the model has besides, whose parameters are estimated with theta."""
     effect_draws: int = 3

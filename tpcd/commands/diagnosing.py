@@ -22,6 +22,7 @@ from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.memory import Memory, digest
 from tpcd.effects.model import Model, write_model
+from tpcd.effects.shape_change import UNCHANGED, ShapeChange
 from tpcd.errors import RunError
 from tpcd.figures.sinks import save_figure
 from tpcd.files import read_json, write_json
@@ -72,13 +73,14 @@ def write_diagnosis(
     prior: str,
     folder: Path,
     writer: Any,
+    shape: ShapeChange = UNCHANGED,
 ) -> Path:
-    """Write all of it into a run folder; returns the page."""
+    """Write all of it, with the shape of its model, into a run folder; returns the page."""
     write_json(folder / "verdict.json", diagnosis.to_plain())
     figures: dict[str, tuple[Figure, str]] = {}
     if diagnosis.belief is not None:
         belief = diagnosis.belief
-        model = Model(belief.prior.effects, belief.step, found_effects(belief))
+        model = Model(belief.prior.effects, belief.step, found_effects(belief), shape)
         write_model(model, folder / "model.yaml", diagnosis.sentence)
         save_belief(belief, folder, prior)
         figures = draw_diagnosis(diagnosis, episodes, least_gain)

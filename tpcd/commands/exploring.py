@@ -74,7 +74,7 @@ def explore_in_folder(
         opened = run_folder(options.out, command, options, options.overwrite, resumable=resumable)
     with opened as folder:
         keep_model(model, folder, options.model)
-        settings = EstimatorSettings(step=model.step, effects=model.informed)
+        settings = EstimatorSettings(step=model.step, effects=model.informed, shape=model.shape)
         estimator = Estimator(shape, options.estimator, settings)
         kept = _kept(folder, estimator, options.prior) if options.resume else Kept()
         done = 0 if kept.state is None else kept.state.index

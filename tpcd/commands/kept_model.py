@@ -42,4 +42,6 @@ def keep_model(model: Model, folder: Path, given: Path | None) -> None:
 
 def _plain(model: Model) -> dict[str, Any]:
     effects = effects_to_plain(model.informed, fingerprints=True)
-    return {"effects": effects, "step": asdict(model.step)}
+    plain = {"effects": effects, "step": asdict(model.step)}
+    shape = model.shape.to_plain()
+    return plain | {"shape": shape} if shape else plain

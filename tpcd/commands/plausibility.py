@@ -18,6 +18,7 @@ from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.checks import NO_CONTACT, check_episode
 from tpcd.data.episode import Episode
 from tpcd.data.table import row_name
+from tpcd.effects.shape_change import ShapeChange
 from tpcd.errors import EpisodeError
 from tpcd.files import read_json
 from tpcd.parameters import Parameters
@@ -41,15 +42,15 @@ TOO_DEEP, LONGEST_LEVER = 0.01, 0.3
 radian that it is turned from it [m]."""
 
 
-def check_start_pose(episode: Episode, shape: Shape) -> None:
+def check_start_pose(episode: Episode, shape: Shape, change: ShapeChange) -> None:
     """Refuse an episode whose start pose is inside floor or wall whatever the priors allow.
 
     Row 0 is the free start pose. Where no drawn outline, mount, floor and wall leaves it
-    free, the poses are in another frame or the priors belong to another scene. Raises
-    `EpisodeError` that says how deep the shallowest draw is.
+    free, the poses are in another frame or the priors belong to another scene. `change` is what
+    a model says of the object. Raises `EpisodeError` that says how deep the shallowest draw is.
     """
     _check_start_of_rows(episode)
-    prior = make_prior(shape, episode.priors)
+    prior = make_prior(shape, change.bounds(episode.priors))
     draws = prior.sample(DRAWS, torch.Generator().manual_seed(0))
     remedy = "check the frame of the poses, or give floor_height and wall_position under priors"
     _refuse_inside(episode, shape, prior.to_parameters(draws), "draws from the priors", remedy)

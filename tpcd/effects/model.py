@@ -1,4 +1,5 @@
-"""An augmented model as a file: which effects the simulator has besides, and how it steps.
+"""An augmented model as a file: which effects the simulator has besides, how it steps, and what
+shapes it expects.
 
 A YAML file:
 
@@ -12,6 +13,11 @@ A YAML file:
         file: my_effects.py              # relative to this file; holds EFFECTS = (...)
     step:                                # optional: settings of the step
       substeps: 6
+    shape:                               # optional: an object unlike those of the shape prior
+      scale: [0.4, 2.4]                  # range of its scale
+      misfit: 4.0                        # times as much error of the outline is expected
+
+Estimates, explorations and diagnoses take the shape; a belief that is there has its own.
 
 Reading a file with `file:` runs the Python code in it; tpcd/effects/README.md says how to write
 one.
@@ -31,6 +37,7 @@ from tpcd.effects.catalogue import KNOWN, find_effect
 from tpcd.effects.declare import DeclaredEffect
 from tpcd.effects.own import file_sha256, load_effects
 from tpcd.effects.protocol import Effect, EffectParameter, effect_to_plain
+from tpcd.effects.shape_change import UNCHANGED, ShapeChange, shape_from_plain
 from tpcd.errors import ModelError
 from tpcd.simulator.record import StepSettings
 
@@ -42,11 +49,12 @@ REACH = 4.0
 
 @dataclass(frozen=True)
 class Model:
-    """Effects, settings of the step, and what is known of the effects."""
+    """Effects, settings of the step, what is known of the effects, and what of the shape."""
 
     effects: tuple[Effect, ...] = ()
     step: StepSettings = StepSettings()
     found: Found = field(default_factory=dict)
+    shape: ShapeChange = UNCHANGED
 
     @property
     def informed(self) -> tuple[Effect, ...]:
@@ -71,9 +79,10 @@ def load_model(path: str | Path) -> Model:
         raise ModelError(path, f"cannot be read ({' '.join(str(error).split())})") from error
     if not isinstance(content, Mapping):
         raise ModelError(path, "is not a mapping", "expected 'effects' and optionally 'step'")
-    unknown = sorted(set(content) - {"effects", "step", "notes"})
+    unknown = sorted(set(content) - {"effects", "step", "shape", "notes"})
     if unknown:
-        raise ModelError(path, f"has {unknown[0]!r}", "expected 'effects', 'step' and 'notes'")
+        expected = "expected 'effects', 'step', 'shape' and 'notes'"
+        raise ModelError(path, f"has {unknown[0]!r}", expected)
     effects = effects_from_plain(content.get("effects") or [], path)
     given = content.get("step") or {}
     known = [setting.name for setting in fields(StepSettings)]
@@ -83,7 +92,11 @@ def load_model(path: str | Path) -> Model:
         step = StepSettings(**given)
     except (TypeError, ValueError) as error:
         raise ModelError(path, f"step: {error}") from error
-    return Model(effects, step, _found_of(content.get("effects") or [], effects, path))
+    try:
+        shape = shape_from_plain(content.get("shape") or {})
+    except ValueError as error:
+        raise ModelError(path, str(error)) from error
+    return Model(effects, step, _found_of(content.get("effects") or [], effects, path), shape)
 
 
 def write_model(model: Model, path: str | Path, notes: str | None = None) -> Path:
@@ -98,6 +111,8 @@ def write_model(model: Model, path: str | Path, notes: str | None = None) -> Pat
     step = {k: v for k, v in asdict(model.step).items() if v != getattr(StepSettings(), k)}
     if step:
         content["step"] = step
+    if model.shape != UNCHANGED:
+        content["shape"] = model.shape.to_plain()
     if notes:
         content["notes"] = notes
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")

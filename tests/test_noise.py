@@ -183,6 +183,26 @@ def test_missing_noise_is_taken_from_the_data_or_from_the_others(tmp_path: Path)
     assert "sensor_std taken from" in note
 
 
+def test_fresh_episodes_take_the_noise_and_give_none(tmp_path: Path) -> None:
+    given, fresh = (silent(write_episode(episode_of(k), tmp_path / f"{k}.csv")) for k in (0, 1))
+    (alone,), _ = read_noisy([given])
+    (told, other), (note,) = read_noisy([given], [fresh])
+    assert torch.equal(told.sensor_std, alone.sensor_std)
+    assert torch.equal(other.sensor_std, alone.sensor_std)
+    assert note.startswith(f"{tmp_path}/0.yaml, {tmp_path}/1.yaml: sensor_std estimated as [")
+    # What a fresh one says of its own noise is of no other.
+    known = write_episode(stated(episode_of(2), 1.5, slice(0, 6)), tmp_path / "2.csv")
+    (told, other), _ = read_noisy([given], [known])
+    assert torch.equal(told.sensor_std, alone.sensor_std)
+    assert torch.equal(other.sensor_std, 1.5 * episode_of(2).sensor_std)
+    (told, other), (note,) = read_noisy([known], [given])
+    assert torch.equal(told.sensor_std, other.sensor_std)
+    assert note == f"{tmp_path}/0.yaml: sensor_std taken from {tmp_path}/2.yaml"
+    short = silent(write_episode(episode_of(0, steps=15), tmp_path / "short.csv"))
+    with pytest.raises(EpisodeError, match=r"short\.yaml: key sensor_std is missing"):
+        read_noisy([short], [known])
+
+
 def test_missing_noise_that_nothing_shows_names_the_motion_that_would(tmp_path: Path) -> None:
     short = silent(write_episode(episode_of(0, steps=15), tmp_path / "short.csv"))
     with pytest.raises(EpisodeError, match="repeat commands in free space and in contact"):

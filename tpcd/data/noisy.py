@@ -20,23 +20,26 @@ NEEDED_MOTION = (
 )
 
 
-def read_noisy(paths: Sequence[Path]) -> tuple[list[Episode], list[str]]:
+def read_noisy(
+    paths: Sequence[Path], fresh: Sequence[Path] = ()
+) -> tuple[list[Episode], list[str]]:
     """Episodes of one set-up where the YAML may not say the noise, and what was done about it.
 
-    Where none of them says it, it is estimated from all of them together; where some do, the
-    others take theirs. Raises `EpisodeError` as `read_episode` does, and where the noise is not
-    given and the data do not show it, with the motion that would.
+    Where none of `paths` says it, it is estimated from all of them together; where some do, the
+    others take theirs. The `fresh` ones, which come last, take the same, and give none. Raises
+    `EpisodeError` as `read_episode` does, and where the noise is not given and the data do not
+    show it, with the motion that would.
     """
-    places = [locate(Path(path)) for path in paths]
+    places = [locate(Path(path)) for path in (*paths, *fresh)]
     headers = [read_header(header) for _, header in places]
     silent = [k for k, header in enumerate(headers) if header.sensor_std is None]
     if not silent:
         return [read_rows(t, h) for (t, _), h in zip(places, headers, strict=True)], []
-    known = [k for k in range(len(headers)) if k not in silent]
+    known = [k for k in range(len(paths)) if k not in silent]
     if known:
         std, note = headers[known[0]].sensor_std, f"sensor_std taken from {places[known[0]][1]}"
     else:
-        rough = [read_rows(t, _quiet(h)) for (t, _), h in zip(places, headers, strict=True)]
+        rough = [read_rows(places[k][0], _quiet(headers[k])) for k in range(len(paths))]
         found = estimate_noise(rough)
         if found is None:
             raise EpisodeError(
@@ -48,12 +51,12 @@ def read_noisy(paths: Sequence[Path]) -> tuple[list[Episode], list[str]]:
     headers = [replace(h, sensor_std=h.sensor_std or std) for h in headers]
     names = ", ".join(str(places[k][1]) for k in silent)
     episodes = [read_rows(t, h) for (t, _), h in zip(places, headers, strict=True)]
-    for episode in () if known else episodes:
+    for k in () if known else silent:
         try:
-            check_noise(episode)
+            check_noise(episodes[k])
         except EpisodeError as error:
             raise EpisodeError(
-                places[silent[0]][1],
+                places[k][1],
                 "key sensor_std is missing, and rows of one command differ by more than noise",
                 "the arm creeps or lags in pauses, so record it at rest for about 10 s and give"
                 " the standard deviations",

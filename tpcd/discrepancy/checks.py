@@ -1,7 +1,7 @@
 """What a diagnosis is given: episodes of one set-up whose noise is known and not plainly wrong.
 
-Noise that no YAML states is estimated from repeated commands; a recording without set points gets
-its answer here, since there is nothing to fit.
+Noise that no YAML states is estimated from repeated commands, of the episodes that are diagnosed
+alone; a recording without set points gets its answer here, since there is nothing to fit.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
     for (table, _), header in zip(places, headers, strict=True):
         if not header.commands_known:
             return Data((), (), answer=_without_commands(table, header))
-    episodes, notes = read_noisy((*paths, *fresh))
+    episodes, notes = read_noisy(paths, fresh)
     for (table, _), episode in zip(places, episodes, strict=True):
         _check_signs(table, episode)
     told = [line for episode in episodes for line in check_noise(episode)]

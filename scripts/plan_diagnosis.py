@@ -10,12 +10,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from tpcd.cli import check_numbers, run
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tpcd.truth.diagnosis_plan import Planned
+
 FAR = 5.0
 """A length beyond this was meant in another unit [m]."""
+ROOM = 0.002
+"""What the limits of the arm leave besides [m]."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +145,41 @@ def _plan(config: Planning) -> None:
         f" {config.wall_position:g} m, both within {1e3 * config.error:g} mm; try the first ones"
         " with a hand at the stop button"
     )
+    print(
+        "to run it, with the hand at the start pose and X Y Z where x = z = 0 of the plan is in the"
+        f" base frame:\n{_robot_line(config, config.out, plan)}"
+    )
+
+
+def _robot_line(config: Planning, out: Path, plan: Sequence[Planned]) -> str:
+    """The command that runs a plan on an arm, with the workspace and steps that it needs, since
+    commands beyond them would be drawn back."""
+    from shlex import join
+
+    from tpcd.commands.exploring_options import ARM_HIGH, ARM_LOW, ExploringOptions
+    from tpcd.truth.motions import FORCE_LIMIT
+
+    usual = {
+        "workspace_low": ARM_LOW,
+        "workspace_high": ARM_HIGH,
+        "step_limit": ExploringOptions.step_limit,
+    }
+    places = list(zip(*(planned.command for planned in plan), strict=True))
+    room = (config.error + ROOM, config.error + ROOM, 0.0)
+    needed = {
+        "workspace_low": [min(axis) - more for axis, more in zip(places, room, strict=True)],
+        "workspace_high": [max(axis) + more for axis, more in zip(places, room, strict=True)],
+        "step_limit": [*(FORCE_LIMIT / k + ROOM for k in config.stiffness[:2]), 0.0],
+    }
+    words = ["python", "scripts/robot.py", "--robot", "ADDRESS", "--origin", "X", "Y", "Z"]
+    words += ["--policy", "file", "--commands", str(out), "--steps", str(len(plan) - 1)]
+    words += ["--stiffness", *(f"{value:g}" for value in config.stiffness)]
+    for name, values in usual.items():
+        farther = min if name == "workspace_low" else max
+        asked = tuple(map(farther, values, needed[name]))
+        if asked != values:
+            words += [f"--{name}", *(f"{value:.3f}" for value in asked)]
+    return join([*words, "--out", "RUN"])
 
 
 def _complete(config: Planning) -> None:
@@ -158,13 +200,16 @@ def _complete(config: Planning) -> None:
                 "found": coverage.counts.get(need, 0.0),
                 "enough": "no" if missing else "yes",
                 "motion that gives it": motion if missing else "",
-                "hides": ", ".join(hidden),
+                "hardly excited": ", ".join(hidden),
             }
         )
     print(format_table(rows))
     blind = [name for name, needs in lacks.items() if needs]
     if blind:
-        print(f"\n{len(blind)} of {len(lacks)} effects could not be named: {', '.join(blind)}")
+        print(
+            f"\n{len(blind)} of {len(lacks)} effects are hardly excited: {', '.join(blind)}; a"
+            " diagnosis tries them all the same, and the motions above would show them"
+        )
     else:
         print("\nnothing is missing: every effect of the catalogue would be excited")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tpcd.cli import check_numbers, run
-from tpcd.commands.exploring_options import ExploringOptions
+from tpcd.commands.exploring_options import ARM_HIGH, ARM_LOW, ExploringOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -60,9 +60,9 @@ class Experiment(ExploringOptions):
     """Mass of gripper and object [kg], to compare with what the controller was told."""
     stop_force: float = 20.0
     """Force on an axis at which the arm stops [N]."""
-    workspace_low: tuple[float, float, float] = (-0.15, -0.15, -0.15)
+    workspace_low: tuple[float, float, float] = ARM_LOW
     """Lower corner of where commands and poses may be [m, m, rad]."""
-    workspace_high: tuple[float, float, float] = (0.3, 0.3, 0.15)
+    workspace_high: tuple[float, float, float] = ARM_HIGH
     """Upper corner [m, m, rad]."""
     rate: float = 125.0
     """Readings and targets each second [Hz]: 125, 250 or 500."""

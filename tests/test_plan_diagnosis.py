@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import csv
+import shlex
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
-from command_calls import call
+from command_calls import call, load_script
 from torch import Tensor
 
+from tpcd.cli import parse
 from tpcd.data import read_episode
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.coverage import MOTIONS, coverage_of
+from tpcd.policies.basic import within
+from tpcd.policies.limits import Limits
 from tpcd.simulator import QuasistaticTruth
 from tpcd.truth.diagnosis_plan import Planned, diagnosis_plan
 from tpcd.truth.motions import FORCE_LIMIT, LARGEST_TILT
@@ -25,6 +29,8 @@ FLOOR_Z, WALL_X = 0.05, 0.1
 150 mm."""
 START = torch.tensor([0.0, 0.12, 0.0], dtype=torch.float64)
 STIFFNESS = torch.tensor([100.0, 100.0, 50.0], dtype=torch.float64)
+ROUNDED = 1e-6
+"""What a file of commands leaves out [m, rad]."""
 
 
 def commands_of(plan: list[Planned]) -> Tensor:
@@ -32,20 +38,25 @@ def commands_of(plan: list[Planned]) -> Tensor:
 
 
 def followed(
-    plan: list[Planned], friction: float = 0.5, floor: float = 0.0, wall: float = 0.15
+    plan: list[Planned],
+    friction: float = 0.5,
+    floor: float = 0.0,
+    wall: float = 0.15,
+    stiffness: Tensor = STIFFNESS,
 ) -> Episode:
     """What a box does under the plan."""
+    start = torch.tensor(plan[0].command, dtype=torch.float64)
     box = torch.tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]]).double() * HALF
-    truth = QuasistaticTruth(box, friction, floor, wall, STIFFNESS)
-    truth.reset(START)
+    truth = QuasistaticTruth(box, friction, floor, wall, stiffness)
+    truth.reset(start)
     commands = commands_of(plan)
-    poses, wrenches = [START], [torch.zeros(3).double()]
+    poses, wrenches = [start], [torch.zeros(3).double()]
     for command in commands[1:]:
         pose, wrench, _ = truth.step(command)
         poses.append(pose)
         wrenches.append(wrench)
     noise = torch.tensor([2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02], dtype=torch.float64)
-    return Episode(commands, torch.stack(poses), torch.stack(wrenches), STIFFNESS, noise)
+    return Episode(commands, torch.stack(poses), torch.stack(wrenches), stiffness, noise)
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +140,31 @@ def test_the_command_writes_a_plan(tmp_path: Path) -> None:
     assert [float(rows[0][name]) for name in ("u_x", "u_z", "u_phi")] == [0.0, 0.12, 0.0]
 
 
+@pytest.mark.parametrize("stiffness", [STIFFNESS.tolist(), [50.0, 60.0, 20.0]])
+@pytest.mark.parametrize("away", [0.0, 0.2])
+def test_the_arm_takes_the_line_and_draws_no_command_back(
+    away: float, stiffness: list[float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a plan.csv"
+    words = ("--start", str(-away), "0.12", "0", "--floor-height", "0.05", "--wall-position", "0.1")
+    given = ("--stiffness", *map(str, stiffness), "--steps", "150", "--out", str(out))
+    assert call("plan_diagnosis", *words, *given) == 0
+    line = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert line[:2] == ["python", "scripts/robot.py"]
+    place = {"ADDRESS": "127.0.0.1", "X": "0.4", "Y": "0", "Z": "0.1", "RUN": str(tmp_path / "run")}
+    robot = load_script("robot")
+    found = parse(robot.Experiment, [place.get(word, word) for word in line[2:]])
+    commands = robot._commands(found.commands)
+    assert found.policy == "file" and found.steps == len(commands) - 1
+    assert list(robot._settings(found).stiffness) == stiffness
+    limits = Limits(found.force_limit, found.step_limit, found.workspace_low, found.workspace_high)
+    plan = [Planned(tuple(command), "") for command in commands.tolist()]
+    episode = followed(plan, stiffness=torch.tensor(stiffness, dtype=torch.float64))
+    for command, pose in zip(commands[1:], episode.poses[:-1], strict=True):
+        box = limits.box(pose, episode.stiffness)
+        torch.testing.assert_close(within(command, *box), command, rtol=0, atol=ROUNDED)
+
+
 def test_the_command_simulates_what_simulate_does(tmp_path: Path) -> None:
     common = ("--steps", "4", "--seed", "3", "--truth", "quasistatic")
     assert call("plan_diagnosis", "--object", "mug", *common, "--out", str(tmp_path / "a")) == 0
@@ -156,7 +192,8 @@ def test_the_command_says_what_an_episode_lacks(
     assert call("plan_diagnosis", "--after", str(tmp_path / "a.csv")) == 0
     printed = capsys.readouterr().out
     assert "stand still" in printed and "command_lag" in printed
-    assert "1 of 23 effects" in printed
+    assert "1 of 23 effects are hardly excited: command_lag" in printed
+    assert "hides" not in printed and "could not" not in printed
     assert len(read_episode(tmp_path / "a.csv")) == 3
 
 

@@ -11,6 +11,8 @@ from tpcd.cli import check_numbers
 WEIGHING = ("active", "lookahead", "grid")
 """Policies that weigh commands against each other."""
 EXTENTS = ("step_limit", "workspace_low", "workspace_high")
+ARM_LOW, ARM_HIGH = (-0.15, -0.15, -0.15), (0.3, 0.3, 0.15)
+"""Corners of the workspace that an arm has unless told otherwise [m, m, rad]."""
 LARGEST_EXTENT = 5.0
 """What is asked for beyond this [m, rad] is taken for millimetres or degrees."""
 

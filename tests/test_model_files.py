@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from effect_cases import block, one_line
 
+from tpcd.discrepancy.coverage import NEEDED
 from tpcd.effects import CATALOGUE
 from tpcd.effects.model import Model, load_model, write_model
 from tpcd.effects.own import load_candidates, load_effects
@@ -96,6 +97,7 @@ SPOILT = {
     "shape": ("conditions.friction * ratio", "ratio[..., 0]"),
     "dtype": ("conditions.friction * ratio", "(conditions.friction * ratio).float()"),
     "null": ("null=0.05", "null=0.5"),
+    "needs": ('"floor slip"', '"floor slips"'),
 }
 TOLD = {
     "not null": "changes friction at the null values",
@@ -108,6 +110,7 @@ TOLD = {
     "shape": "'wet_floor'",
     "dtype": "'wet_floor'",
     "null": "null value 0.5 of 'edge' outside of its range",
+    "needs": f"needs 'floor slips', expected any of {', '.join(NEEDED)}",
 }
 
 

@@ -2,7 +2,7 @@
 
 It is applied to a few made-up particles and rows, before and after a first outcome. At the
 null values of its parameters nothing may change, not by one bit; and what it makes of one
-particle may not depend on the others.
+particle may not depend on the others. What it needs are excitations that a diagnosis knows.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from tpcd.discrepancy.coverage import NEEDED
 from tpcd.effects.conditions import Conditions, Outcome, Rows, bare_conditions, sequence
 from tpcd.effects.guard import FIELDS
 from tpcd.effects.protocol import Added, Effect, EffectParameter, parameter_bounds
@@ -32,6 +33,10 @@ def check_effect(effect: Effect) -> None:
                 f"has null value {parameter.null} of {parameter.name!r} outside of its range"
                 f" [{parameter.low}, {parameter.high}]",
             )
+    unknown = [need for need in effect.needs if need not in NEEDED]
+    if unknown:
+        known = ", ".join(NEEDED)
+        raise EffectError(effect.name, f"needs {unknown[0]!r}, expected any of {known}")
     rows, conditions, outcome = _made_up()
     null = torch.tensor([p.null for p in effect.parameters], dtype=torch.float64)
     low, high = parameter_bounds([effect])

@@ -73,7 +73,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         open_diagnosis,
         write_diagnosis,
     )
-    from tpcd.commands.gap_rows import shown_gaps, shown_share
+    from tpcd.commands.gap_rows import shown_data, shown_gaps, shown_share
     from tpcd.commands.work_line import WorkLine
     from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.search import DiagnosisSettings, diagnose
@@ -116,7 +116,8 @@ def diagnose_episodes(config: Diagnose) -> int:
                 )
         found = replace(found, notes=(*data.notes, *found.notes))
         if found.gap:
-            print(f"\none-step errors on {found.held_out}, with 90 % intervals")
+            where = shown_data(found, bool(data.fresh))
+            print(f"\none-step errors on {where}, with 90 % intervals")
             print(format_table(shown_gaps(found.gap)))
             print(f"closed of the excess over the noise, all channels: {shown_share(found)}")
         change = UNCHANGED

@@ -11,6 +11,7 @@ from command_calls import PRIOR, call
 from made_diagnosis import a_diagnosis
 
 from tpcd.commands.diagnosing import fits_of
+from tpcd.commands.gap_rows import shown_data
 from tpcd.discrepancy.diagnosis import Candidate, Diagnosis
 from tpcd.discrepancy.memory import Memory
 
@@ -93,3 +94,10 @@ def test_a_stopped_run_keeps_its_fits_and_goes_on(
     assert len({salt, fits_of(out, ()).salt, told[0].salt}) == 3
     assert call("diagnose", *words, "--resume") == 2
     assert "has its verdict" in capsys.readouterr().err
+
+
+def test_blocks_held_out_are_said_to_be_optimistic() -> None:
+    fresh, blocks = a_diagnosis(), replace(a_diagnosis(), held_out="blocks held out")
+    assert shown_data(fresh, True) == fresh.held_out
+    told = shown_data(blocks, False)
+    assert told.startswith(blocks.held_out) and "optimistic" in told and "--fresh" in told

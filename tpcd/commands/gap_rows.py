@@ -14,6 +14,14 @@ def shown_gaps(gaps: Sequence[Gap], by_contact: bool = False) -> list[dict[str, 
     return [_shown(gap, by_contact) for gap in gaps]
 
 
+def shown_data(found: Diagnosis, fresh: bool) -> str:
+    """Which data the errors are of. Blocks held out are of the episodes that the naming used, so
+    that errors after it are optimistic there."""
+    if fresh:
+        return found.held_out
+    return f"{found.held_out}, which the naming used too (optimistic; --fresh is not)"
+
+
 def shown_share(found: Diagnosis) -> str:
     """What is closed of the gap of all channels together, as text: `95 % (90 to 99)`, and of that
     in typical rows, in which those that land in another contact decide nothing."""

@@ -129,9 +129,7 @@ def _sizes(effect: dict[str, Any]) -> list[str]:
 
 
 def _percent(before: float | None, after: float | None) -> str:
-    if before is None or after is None:
-        return ""
-    return f"{before:.0%} to {after:.0%}"
+    return "" if before is None or after is None else f"{before:.0%} to {after:.0%}"
 
 
 def render_page(

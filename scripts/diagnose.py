@@ -116,7 +116,7 @@ def diagnose_episodes(config: Diagnose) -> int:
                 )
         found = replace(found, notes=(*data.notes, *found.notes))
         if found.gap:
-            where = shown_data(found, bool(data.fresh))
+            where = shown_data(found)
             print(f"\none-step errors on {where}, with 90 % intervals")
             print(format_table(shown_gaps(found.gap)))
             print(f"closed of the excess over the noise, all channels: {shown_share(found)}")

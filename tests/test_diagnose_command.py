@@ -12,7 +12,7 @@ from made_diagnosis import a_diagnosis
 
 from tpcd.commands.diagnosing import fits_of
 from tpcd.commands.gap_rows import shown_data
-from tpcd.discrepancy.diagnosis import Candidate, Diagnosis
+from tpcd.discrepancy.diagnosis import BLOCKS, Candidate, Diagnosis
 from tpcd.discrepancy.memory import Memory
 
 
@@ -97,7 +97,7 @@ def test_a_stopped_run_keeps_its_fits_and_goes_on(
 
 
 def test_blocks_held_out_are_said_to_be_optimistic() -> None:
-    fresh, blocks = a_diagnosis(), replace(a_diagnosis(), held_out="blocks held out")
-    assert shown_data(fresh, True) == fresh.held_out
-    told = shown_data(blocks, False)
+    fresh, blocks = a_diagnosis(), replace(a_diagnosis(), held_out=BLOCKS)
+    assert shown_data(fresh) == fresh.held_out
+    told = shown_data(blocks)
     assert told.startswith(blocks.held_out) and "optimistic" in told and "--fresh" in told

@@ -17,7 +17,7 @@ from tpcd.belief.augmented import found_effects
 from tpcd.belief.storage import save_belief
 from tpcd.commands.diagnosis_figures import draw_diagnosis
 from tpcd.commands.diagnosis_rows import shown_coverage, shown_evidence, shown_tests
-from tpcd.commands.gap_rows import shown_gaps, shown_share
+from tpcd.commands.gap_rows import shown_data, shown_gaps, shown_share
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.memory import Memory, digest
@@ -142,6 +142,7 @@ def render_page(
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(template).render(
         d=diagnosis,
+        data=shown_data(diagnosis),
         share=shown_share(diagnosis),
         tables=[shown_gaps(diagnosis.gap), shown_gaps(diagnosis.gap_by_contact, by_contact=True)],
         evidence=[

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tpcd.discrepancy.diagnosis import Diagnosis, Gap
+from tpcd.discrepancy.diagnosis import BLOCKS, Diagnosis, Gap
 from tpcd.figures.style import display_unit
 
 
@@ -14,10 +14,10 @@ def shown_gaps(gaps: Sequence[Gap], by_contact: bool = False) -> list[dict[str, 
     return [_shown(gap, by_contact) for gap in gaps]
 
 
-def shown_data(found: Diagnosis, fresh: bool) -> str:
+def shown_data(found: Diagnosis) -> str:
     """Which data the errors are of. Blocks held out are of the episodes that the naming used, so
     that errors after it are optimistic there."""
-    if fresh:
+    if found.held_out != BLOCKS:
         return found.held_out
     return f"{found.held_out}, which the naming used too (optimistic; --fresh is not)"
 

@@ -10,7 +10,7 @@ from tpcd.belief.belief import Belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.deciding import deciding_motion
-from tpcd.discrepancy.diagnosis import Alternative, Diagnosis, NamedEffect, Verdict
+from tpcd.discrepancy.diagnosis import BLOCKS, Alternative, Diagnosis, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import Fit, Question, joined_fit, posterior
 from tpcd.discrepancy.gaps import Errors, Gaps, gaps, typical_share
@@ -104,7 +104,7 @@ def conclude(
         share_closed_low=gap.low,
         share_closed_high=gap.high,
         share_closed_typical=gap.typical,
-        held_out="fresh episodes" if fresh else "blocks held out",
+        held_out="fresh episodes" if fresh else BLOCKS,
         cells_before=found.before.cells,
         cells_after=found.after.cells,
         unexplained_before=found.before.unexplained,

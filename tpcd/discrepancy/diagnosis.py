@@ -17,6 +17,8 @@ Verdict = Literal[
 ]
 CHANNELS = ("x", "z", "phi", "F_x", "F_z", "tau")
 """Channels of the gap in order; units m, m, rad, N, N, N·m."""
+BLOCKS = "blocks held out"
+"""What the gap is measured on where there are no fresh episodes."""
 
 
 @dataclass(frozen=True)

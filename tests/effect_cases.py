@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
+import pytest
 import torch
 from command_calls import ROOT
 from torch import Tensor
@@ -13,7 +15,9 @@ from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
+from tpcd.effects.model import load_model
 from tpcd.effects.protocol import Added
+from tpcd.errors import ModelError
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
@@ -59,3 +63,14 @@ def one_line(error: BaseException) -> str:
     line = str(error)
     assert "\n" not in line
     return line
+
+
+def refused_model(folder: Path, text: str) -> str:
+    """What is said of a model file that holds the text."""
+    path = folder / "model.yaml"
+    path.write_text(text)
+    with pytest.raises(ModelError) as caught:
+        load_model(path)
+    told = one_line(caught.value)
+    assert str(path) in told
+    return told

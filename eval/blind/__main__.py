@@ -49,8 +49,7 @@ class Blind:
     workers: int = 1
     """Processes that share the work on this machine."""
     quick: bool = False
-    """Three cases of 20 steps, for a smoke run: 4 minutes of one core beside another job, when last
-    measured (2026-11-26)."""
+    """Three cases of 20 steps, for a smoke run of two to four minutes."""
     resume: bool = False
     """Go on with the cases that an earlier run in the folder did not finish."""
     overwrite: bool = False

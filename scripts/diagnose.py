@@ -4,16 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tpcd.cli import check_numbers, run
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from tpcd.data.episode import Episode
-    from tpcd.effects.shape_change import ShapeChange
-    from tpcd.shape.deepsdf import DeepSDFShape
 
 USUAL_OUT = Path("runs/diagnosis")
 
@@ -99,8 +91,7 @@ def diagnose_episodes(config: Diagnose) -> int:
         print(f"note: {note}")
     shape = load_prior(config.prior)
     model = Model() if config.model is None else load_model(config.model)
-    given, expected = _with_shape(data.episodes, shape, model.shape)
-    settings = replace(DiagnosisSettings(), seed=config.seed, step=model.step)
+    settings = DiagnosisSettings(seed=config.seed, step=model.step, shape=model.shape)
     own = load_candidates(config.candidates, (*settings.catalogue, *FORMULAS))
     settings = replace(settings, catalogue=(*settings.catalogue, *own))
     with open_diagnosis(config, config.out, config.overwrite, config.resume) as folder:
@@ -112,7 +103,7 @@ def diagnose_episodes(config: Diagnose) -> int:
             with WorkLine() as line:
                 memory = replace(fits_of(folder, files), watch=line.begin)
                 found = diagnose(
-                    given, expected, settings, data.fresh, model.effects, line.tell, memory
+                    data.episodes, shape, settings, data.fresh, model.effects, line.tell, memory
                 )
         found = replace(found, notes=(*data.notes, *found.notes))
         if found.gap:
@@ -137,20 +128,6 @@ def diagnose_episodes(config: Diagnose) -> int:
         )
     print()
     return EXIT_CODES[found.verdict]
-
-
-def _with_shape(
-    episodes: Sequence[Episode], shape: DeepSDFShape, change: ShapeChange
-) -> tuple[list[Episode], DeepSDFShape]:
-    """Episodes and shape prior that expect what a model says of the object."""
-    from dataclasses import replace
-
-    from tpcd.belief.belief import misfit_field
-    from tpcd.belief.settings import EstimatorSettings
-
-    sd = misfit_field(shape, EstimatorSettings(shape=change)).sd
-    wide = replace(shape, misfit=replace(shape.misfit, sd=sd))
-    return [replace(one, priors=change.bounds(one.priors)) for one in episodes], wide
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from tpcd.belief.prior import make_prior
 from tpcd.contact import scene_from_parameters
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy, check_adequacy
-from tpcd.discrepancy.diagnosis import CHANNELS
+from tpcd.discrepancy.diagnosis import CHANNELS, Cell
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.effects import find_effect
 from tpcd.parameters import Parameters
@@ -134,3 +134,18 @@ def test_rows_that_the_model_does_not_explain_are_told() -> None:
     # A row that is off, and the one that follows it and starts there.
     assert set(off) <= set(rows) | {row + 1 for row in rows}
     assert f"rows {rows[0]}, {rows[1]}" in found.left(LEVEL)
+
+
+def test_what_goes_with_something_is_told_before_what_scatters() -> None:
+    cells = tuple(
+        Cell("all", channel, covariate, score, 40)
+        for channel, covariate, score in (
+            ("F_z", "size", 9.8),
+            ("F_z", "load", 7.5),
+            ("z", "time", 3.0),
+        )
+    )
+    found = Adequacy(0.0, 1.0, 0.0, cells, limit=4.5)
+    assert found.left(LEVEL) == cells[1].words
+    assert replace(found, limit=8.0).left(LEVEL) == cells[0].words
+    assert replace(found, cells_p=0.5).left(LEVEL) == ""

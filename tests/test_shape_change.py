@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_calls import PRIOR, call, load_script, make_world
+from command_calls import PRIOR, call, make_world
 from effect_cases import SHAPE, make_episode, refused_model
-from test_diagnose_command import a_diagnosis
+from made_diagnosis import a_diagnosis
 
 from tpcd.belief import EstimatorSettings, SamplerSettings
 from tpcd.belief.augmented import shape_change_of
@@ -19,6 +19,8 @@ from tpcd.belief.prior import make_prior
 from tpcd.belief.storage import load_belief
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.fit import FIT_SAMPLER, Question
+from tpcd.discrepancy.memory import Memory
+from tpcd.discrepancy.search import DiagnosisSettings, _question
 from tpcd.discrepancy.variants import SCALES, WIDER_MISFIT, wide_shape
 from tpcd.effects.model import Model, load_model, write_model
 from tpcd.effects.shape_change import UNCHANGED, ShapeChange
@@ -96,16 +98,13 @@ def test_a_misfit_that_is_given_is_taken_as_it_is() -> None:
     assert misfit_field(SHAPE, given) == misfit_field(SHAPE, replace(given, shape=UNCHANGED))
 
 
-def test_a_diagnosis_is_given_the_same(episode: Episode) -> None:
-    shape = load_prior(PRIOR)
-    given, expected = load_script("diagnose")._with_shape([episode], shape, WIDE)
-    target = target_of(episode, shape, EstimatorSettings(shape=WIDE))
-    assert torch.equal(make_prior(expected, given[0].priors).low, target.prior.low)
-    assert torch.equal(make_prior(expected, given[0].priors).high, target.prior.high)
-    assert misfit_field(expected, EstimatorSettings()) == target.misfit
-    same, unchanged = load_script("diagnose")._with_shape([episode], shape, UNCHANGED)
-    assert same[0].priors == episode.priors
-    assert misfit_field(unchanged, EstimatorSettings()) == misfit_field(shape, EstimatorSettings())
+@pytest.mark.parametrize("change", [UNCHANGED, WIDE])
+def test_a_diagnosis_expects_the_same_as_an_estimate(change: ShapeChange, episode: Episode) -> None:
+    question = _question([episode], SHAPE, DiagnosisSettings(shape=change), Memory())
+    target = target_of(episode, SHAPE, EstimatorSettings(shape=change))
+    assert torch.equal(question.scene.low, target.prior.low)
+    assert torch.equal(question.scene.high, target.prior.high)
+    assert question.misfit == target.misfit
 
 
 def test_a_diagnosis_writes_what_it_took(episode: Episode, tmp_path: Path) -> None:

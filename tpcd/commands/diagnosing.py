@@ -142,7 +142,7 @@ def render_page(
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(template).render(
         d=diagnosis,
-        data=shown_data(diagnosis),
+        measured_on=shown_data(diagnosis),
         share=shown_share(diagnosis),
         tables=[shown_gaps(diagnosis.gap), shown_gaps(diagnosis.gap_by_contact, by_contact=True)],
         evidence=[

@@ -143,16 +143,16 @@ def name_one(bench: Workbench, current: Fit, pool: Sequence[Effect], adequate: b
             gain = full.log_evidence - current.log_evidence
         by_seed = () if full is None else full.by_seed
         bench.candidates.append(Candidate(g.effect.name, number, gain, by_seed))
-    _tell_gains(bench, current, number)
+    _tell_gains(bench, current, bench.candidates[-len(glances) :] if glances else [])
     if not near:
         return Round(current)
     return _judged(bench, current, near, number)
 
 
-def _tell_gains(bench: Workbench, current: Fit, number: int) -> None:
-    """A line on the candidates of a round: what full fits gain, on each seed, and what the best of
+def _tell_gains(bench: Workbench, current: Fit, tried: Sequence[Candidate]) -> None:
+    """A line on what was tried in a round: what full fits gain, on each seed, and what the best of
     the others promises."""
-    tried = sorted((c for c in bench.candidates if c.round == number), key=lambda c: -c.gain)
+    tried = sorted(tried, key=lambda c: -c.gain)
     told = []
     for c in (one for one in tried if one.by_seed):
         seeds = ", ".join(f"{found - current.log_evidence:+.1f}" for found in c.by_seed)
@@ -162,7 +162,7 @@ def _tell_gains(bench: Workbench, current: Fit, number: int) -> None:
         rest = "the others promise" if told else "none of the effects promises more than"
         told.append(f"{rest} {others[0].gain:+.1f}" + (" at most" if told else ""))
     if told:
-        bench.tell(f"round {number}: gain of log evidence: {'; '.join(told)}")
+        bench.tell(f"round {tried[0].round}: gain of log evidence: {'; '.join(told)}")
 
 
 def _judged(bench: Workbench, current: Fit, near: Sequence[Fit], number: int) -> Round:

@@ -87,8 +87,8 @@ def _question(
         sampler = replace(sampler, **dict.fromkeys(none, 1))
     return Question(
         history,
-        make_prior(shape, episodes[0].priors),
-        misfit_field(shape, EstimatorSettings()),
+        make_prior(shape, settings.shape.bounds(episodes[0].priors)),
+        misfit_field(shape, EstimatorSettings(shape=settings.shape)),
         settings.step,
         sampler,
         settings.seed,

@@ -8,6 +8,7 @@ from tpcd.belief.settings import SamplerSettings
 from tpcd.discrepancy.fit import FIT_SAMPLER
 from tpcd.effects import CATALOGUE
 from tpcd.effects.protocol import Effect
+from tpcd.effects.shape_change import UNCHANGED, ShapeChange
 from tpcd.simulator import StepSettings
 
 FEWEST_ROWS = 10
@@ -102,5 +103,7 @@ class DiagnosisSettings:
     level: float = 0.001
     """Level of the test that says whether something is left."""
     step: StepSettings = field(default_factory=StepSettings)
+    shape: ShapeChange = UNCHANGED
+    """What is expected of the object besides what the shape model says."""
     sampler: SamplerSettings = FIT_SAMPLER
     catalogue: tuple[Effect, ...] = CATALOGUE

@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from tpcd.errors import FileError
+from tpcd.quality.finding import Finding, usable
+from tpcd.quality.stream import Stream
 
 AXES = ("x", "y", "z")
 
@@ -46,6 +48,15 @@ class Log:
     """Further columns that are to be kept."""
     notes: tuple[str, ...] = ()
     """What the reader had to do or leave out, for people."""
+    streams: tuple[Stream, ...] = ()
+    """The sensors as they were recorded, each on its own clock, before they were joined."""
+    findings: tuple[Finding, ...] = ()
+    """What checks of the recording found; their times are those of `times`."""
+
+    @property
+    def usable(self) -> Bool[np.ndarray, " n"]:
+        """The samples that no finding leaves out."""
+        return usable(self.times, self.findings)
 
     def __len__(self) -> int:
         """Number of samples."""

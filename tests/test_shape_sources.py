@@ -57,6 +57,29 @@ def test_units_are_turned_into_metres(tmp_path, unit, factor, ending):
     np.testing.assert_allclose(found.vertices, HAMMER, atol=1e-14)
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "0,00;0,00\n0,06;0,00\n0,06;0,09\n0,00;0,09\n",
+        "x;z\n0;0\n0,06;0\n0,06;0,09\n0;0,09\n",
+        "0\t0\n6e-2\t0\n0,06\t0,09\n0\t9,0E-2\n",
+        "0 0\n0,06 0\n0,06 0,09\n0 0,09\n",
+        "0, 0\n0.06, 0\n0.06, 0.09\n0, 0.09\n",
+        "0,0,\n0.06,0,\n0.06,0.09,\n0,0.09,\n",
+    ],
+)
+def test_decimal_commas_are_read_where_something_else_parts_the_numbers(tmp_path, rows):
+    outline = load_outlines(write(tmp_path / "plate.csv", rows))["plate"]
+    assert outline.area == pytest.approx(0.0054)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
+def test_a_csv_is_read_in_every_encoding(tmp_path, encoding):
+    path = tmp_path / "plate.csv"
+    path.write_bytes("# Gehäuse\n0,0\n0.06,0\n0.06,0.09\n0,0.09\n".encode(encoding))
+    assert load_outlines(path)["plate"].area == pytest.approx(0.0054)
+
+
 def test_a_csv_in_millimetres_without_saying_so_gets_the_hint(tmp_path):
     path = tmp_path / "hammer.csv"
     np.savetxt(path, HAMMER * 1000, delimiter=",")
@@ -71,6 +94,7 @@ def test_a_csv_in_millimetres_without_saying_so_gets_the_hint(tmp_path):
         ("x,z\n0,0\n0.1,zero\n0.1,0.1\n", "line 3 is '0.1,zero'"),
         ("x,z\nmore,words\n0,0\n", "line 2 is 'more,words'"),
         ("0,0\n0.1,0,5\n0.1,0.1\n", "line 2 has 3 numbers"),
+        ("0,0,0,0\n", "part x and z by a semicolon"),
         ("0,0\n0.1\n0.1,0.1\n", "line 2 has 1 numbers"),
         ("0,0\n0.1,nan\n0.1,0.1\n", "vertex 1 is (0.1, nan)"),
         ("0,0\n0.1,0.1\n0.1,0\n0,0.1\n", "crosses or touches itself at (0.05, 0.05) m"),
@@ -82,7 +106,7 @@ def test_a_bad_csv_is_refused_with_its_line(tmp_path, text, expected):
 
 def test_a_csv_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "bad.csv"
-    path.write_bytes(b"\xff\xfe\x00\x81")
+    path.write_bytes(b"\x89PNG\x00\x81")
     assert "not readable as text" in refusal(path)
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tpcd.errors import OutlineError
-from tpcd.shape.svg import load_svg
+from tpcd.shape.svg import _shapes, _user_to_metres, load_svg
 from tpcd.shape.svg_path import arc_segments, flatten, parse_path
 
 MM = 'width="200mm" height="100mm" viewBox="0 0 200 100"'
@@ -23,6 +25,11 @@ def drawing(tmp_path, body: str, root: str = MM):
 def single(tmp_path, body: str, root: str = MM, **options):
     (outline,) = load_svg(drawing(tmp_path, body, root), **options).values()
     return outline
+
+
+def svg_shapes(path):
+    root = ElementTree.parse(path).getroot()
+    return list(_shapes(root, _user_to_metres(root, None)))
 
 
 def refusal(path, **options) -> str:
@@ -199,10 +206,69 @@ def test_several_shapes_get_their_ids_or_numbers(tmp_path):
     assert list(load_svg(drawing(tmp_path, body))) == ["coin", "part-2", "coin-3"]
 
 
+INNER = '<svg {} viewBox="0 0 4 6"><rect id="a" width="2" height="3"/></svg>'
+
+
+@pytest.mark.parametrize(
+    ("inner", "size", "corner"),
+    [
+        ('x="10" y="20" width="40" height="60"', (0.02, 0.03), (10, 20)),
+        ('width="40" height="60"', (0.02, 0.03), (0, 0)),
+        ('width="80" height="60"', (0.02, 0.03), (20, 0)),
+        ('width="80" height="60" preserveAspectRatio="xMaxYMin"', (0.02, 0.03), (40, 0)),
+        ('width="80" height="60" preserveAspectRatio="xMinYMid slice"', (0.04, 0.06), (0, -30)),
+        ('width="80" height="60" preserveAspectRatio="none"', (0.04, 0.03), (0, 0)),
+        ('x="5%" width="20%" height="60%"', (0.02, 0.03), (10, 0)),
+        ("", (1 / 30, 0.05), (200 / 3, 0)),
+    ],
+)
+def test_an_inner_drawing_is_scaled_and_placed_by_its_own_view_box(tmp_path, inner, size, corner):
+    """Against SVG 2, 8.2, worked out by hand."""
+    both = f'<svg><g>{INNER.format(inner)}</g></svg><rect id="b" width="200" height="100"/>'
+    found = load_svg(drawing(tmp_path, both))
+    assert found["a"].size == pytest.approx(size)
+    path = drawing(tmp_path, INNER.format(inner))
+    ((_, ((first, *_),)),) = svg_shapes(path)
+    np.testing.assert_allclose(1e3 * first[0] * [1, -1], corner, atol=1e-9)
+
+
+def test_inner_drawings_nest(tmp_path):
+    body = (
+        '<svg width="100" height="100" viewBox="0 0 10 10"><svg x="1" width="50%" height="5"'
+        ' viewBox="0 0 50 50"><rect width="50" height="25"/></svg></svg>'
+    )
+    assert single(tmp_path, body).size == pytest.approx((0.05, 0.025))
+
+
+def test_lines_beside_a_shape_are_left_out_and_told(tmp_path):
+    body = '<path d="M0 0L50 50"/><path d="M0 0H9H20"/><rect id="plate" width="60" height="90"/>'
+    found = load_svg(drawing(tmp_path, body))
+    assert list(found) == ["plate"]
+    assert "2 lines without an area left out" in found["plate"].notes
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "<style>.h{display:none}</style><rect width='60' height='90'/>",
+        "<style>rect{width:60px}</style><rect width='6' height='9'/>",
+        "<rect style='transform: scale(2)' width='60' height='90'/>",
+    ],
+)
+def test_styles_that_change_shapes_are_refused(tmp_path, body):
+    assert "a style hides, moves or sizes shapes" in refusal(drawing(tmp_path, body))
+
+
+def test_styles_of_colour_change_nothing(tmp_path):
+    body = "<style>.a{fill:#f00;stroke-width:2}</style><rect class='a' width='60' height='90'/>"
+    assert single(tmp_path, body).area == pytest.approx(0.0054)
+
+
 def test_what_is_not_drawn_is_left_out(tmp_path):
     body = (
         '<defs><circle id="no" r="5"/></defs><circle style="display: none" r="5"/>'
-        '<g display="none"><circle r="5"/></g><text>hello</text><!-- note --><circle r="12"/>'
+        '<g display="none"><circle r="5"/></g><circle visibility="hidden" r="5"/>'
+        '<text>hello</text><!-- note --><circle r="12"/>'
     )
     assert list(load_svg(drawing(tmp_path, body))) == ["part"]
 

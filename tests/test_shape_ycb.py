@@ -15,7 +15,8 @@ import shapely
 from tpcd.errors import FileError, OutlineError
 from tpcd.shape import ycb
 from tpcd.shape.builtin import builtin_outlines
-from tpcd.shape.section import CuttingPlane, cut_mesh, load_mesh
+from tpcd.shape.mesh import load_mesh
+from tpcd.shape.section import CuttingPlane, cut_mesh
 from tpcd.shape.ycb import FOLDER_VARIABLE, GRASPABLE_21, load_ycb, ycb_folder, ycb_meshes
 from tpcd.shape.ycb_archive import UNSUITABLE, write_slices
 

@@ -1,8 +1,10 @@
 """Outlines from triangle meshes: a plane cut, or the silhouette in one direction.
 
 A `CuttingPlane` carries the frame of the outline: its x axis is horizontal in the picture, its
-z axis is `up`. Of a cut, the largest loop is kept and its holes are filled. Mesh coordinates
-are metres unless a unit is given. Only closed meshes are cut: an open one has no inside.
+z axis is `up`. A cut is a set of line pieces; whatever they enclose is filled, so that faces given
+twice, faces without area, inner shells and bodies that overlap or share a face change nothing. The
+largest piece is kept. Where the pieces leave a gap in the boundary the mesh has a hole there, and
+the cut is refused with the place.
 """
 
 from __future__ import annotations
@@ -16,14 +18,16 @@ import shapely
 from jaxtyping import Float
 
 from tpcd.errors import OutlineError
-from tpcd.shape.outline import METRES_PER_UNIT, Outline, make_outline
+from tpcd.shape.outline import Outline, make_outline
 
 if TYPE_CHECKING:
     import trimesh
 
-MESH_ENDINGS = (".ply", ".stl", ".obj")
 GRID = 1e-9
-"""Ends of neighbouring pieces of a cut are matched on this grid [m]."""
+"""Resolution of outlines [m]."""
+NEIGHBOURS = (0.0, 1e-6, 1e-5)
+"""Ends of pieces this near, in mesh sizes beyond `GRID`, are one point; tried in turn: vertices of
+faces that were written one by one differ by rounding."""
 SMALLEST_TRIANGLE = 1e-14
 """Projected triangles below this area are seen edge on [m^2]."""
 NUDGES = (0.0, 1e-6, -1e-6, 3e-6, -3e-6)
@@ -59,35 +63,6 @@ class CuttingPlane:
         across = np.cross(self.up, normal)
         across /= np.linalg.norm(across)
         return across, np.cross(normal, across), normal
-
-
-def load_mesh(path: str | Path, *, unit: str = "m") -> trimesh.Trimesh:
-    """Read a `.ply`, `.stl` or `.obj` mesh, scaled to metres, equal vertices merged.
-
-    Raises:
-        OutlineError: missing, unreadable, or without faces.
-    """
-    import trimesh
-
-    path = Path(path)
-    if unit not in METRES_PER_UNIT:
-        raise ValueError(f"unit must be one of {', '.join(METRES_PER_UNIT)}, got {unit!r}")
-    if path.suffix.lower() not in MESH_ENDINGS:
-        raise OutlineError(path, "not a mesh file", f"expected {', '.join(MESH_ENDINGS)}")
-    if not path.is_file():
-        raise OutlineError(path, "not found", "give a mesh file")
-    try:
-        mesh = trimesh.load_mesh(path, file_type=path.suffix[1:].lower(), skip_materials=True)
-        faces = len(mesh.faces)
-    except Exception as error:  # the readers of trimesh raise whatever they stumble over
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise OutlineError(path, f"not readable as a mesh ({reason})", "export it again") from None
-    if not faces:
-        raise OutlineError(path, "has no faces", "give a triangle mesh")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    if unit != "m":
-        mesh.apply_scale(METRES_PER_UNIT[unit])
-    return mesh
 
 
 def upright_plane(
@@ -133,16 +108,10 @@ def cut_mesh(
     lids of cans) up to a straight line across the opening.
 
     Raises:
-        OutlineError: the mesh is not watertight, the plane misses it, the cut crosses itself,
-            or it is no outline of plausible size.
+        OutlineError: the cut is open (with the place) or in pieces that touch, the plane misses the
+            mesh, or it is no outline of plausible size.
     """
     blame = path if path is not None else f"mesh '{name}'"
-    if not mesh.is_watertight:
-        raise OutlineError(
-            blame,
-            f"the mesh is not watertight ({_open_edges(mesh)} open edges)",
-            "close its holes first",
-        )
     loops = _loops(mesh, plane if plane is not None else upright_plane(mesh), blame)
     largest = max(loops, key=lambda loop: loop.area)
     pieces = [p for p in loops if p is not largest and not largest.contains(p)]
@@ -196,48 +165,76 @@ def mesh_silhouette(
 
 
 def _loops(mesh: trimesh.Trimesh, plane: CuttingPlane, blame: str | Path) -> list[shapely.Polygon]:
-    """Closed loops of the cut as polygons in the axes of the plane."""
+    """What the pieces of the cut enclose, as polygons in the axes of the plane."""
     from trimesh.intersections import mesh_plane
 
     across, up, normal = plane.axes()
     size = float(mesh.scale)
-    touched = False
+    ends: np.ndarray | None = None
     for nudge in NUDGES:
         origin = plane.origin + nudge * size * normal
         pieces = np.asarray(mesh_plane(mesh, normal, origin)).reshape(-1, 2, 3)
         if not len(pieces):
             continue
-        touched = True
-        flat = np.round((pieces - plane.origin) @ np.stack((across, up), axis=1) / GRID) * GRID
-        flat = flat[(flat[:, 0] != flat[:, 1]).any(axis=1)]
-        merged = shapely.line_merge(shapely.MultiLineString(list(flat)))
-        lines = list(getattr(merged, "geoms", [merged]))
-        if lines and all(line.is_closed for line in lines):
-            rings = [line for line in lines if len(line.coords) > 3]
-            _check_uncrossed(rings, blame)
-            return [shapely.Polygon(ring) for ring in rings]
-    if not touched:
+        flat = (pieces - plane.origin) @ np.stack((across, up), axis=1)
+        for nearness in NEIGHBOURS:
+            filled, loose = _enclosed(flat, GRID + nearness * size)
+            if not filled.is_empty and loose.is_empty:
+                loops = list(getattr(filled, "geoms", [filled]))
+                _check_apart(loops, blame)
+                return loops
+            if ends is None:
+                ends = shapely.get_coordinates(shapely.boundary(loose))
+    if ends is None:
         raise OutlineError(
             blame, "the plane misses the mesh", f"its points lie within {mesh.bounds.tolist()} m"
         )
-    raise OutlineError(
-        blame, "the cut is not a set of closed loops: the mesh meets itself", "repair the mesh"
-    )
+    count = _open_edges(mesh)
+    hole = f"the mesh has {count} open edges" if count else "the mesh meets itself there"
+    where = f" at ({ends[0, 0]:.4g}, {ends[0, 1]:.4g}) m" if len(ends) else ""
+    raise OutlineError(blame, f"the cut is open{where} ({hole})", "close the mesh or cut elsewhere")
 
 
-def _check_uncrossed(rings: list[shapely.LineString], blame: str | Path) -> None:
-    """Refuse loops that cross themselves or each other."""
-    remedy = "repair the mesh (unite its bodies) or cut elsewhere"
-    for index, ring in enumerate(rings):
-        if not ring.is_simple:
-            raise OutlineError(blame, "the mesh crosses itself in the cut", remedy)
-        for other in rings[:index]:
-            if ring.intersects(other):
-                place = ring.intersection(other).representative_point()
+def _enclosed(
+    pieces: Float[np.ndarray, "k 2 2"], nearness: float
+) -> tuple[shapely.Geometry, shapely.Geometry]:
+    """What line pieces enclose once ends within `nearness` [m] are one point, and the lines outside
+    of it, which end nowhere."""
+    joined = _joined(pieces.reshape(-1, 2), nearness).reshape(-1, 2, 2)
+    joined = joined[(joined[:, 0] != joined[:, 1]).any(axis=1)]
+    lines = shapely.union_all(shapely.linestrings(joined))
+    cells, bridges, dangles, _ = shapely.polygonize_full([lines])
+    rings = shapely.get_exterior_ring(shapely.get_parts(cells))
+    filled = shapely.union_all(shapely.polygons(rings))
+    # Where two long edges of a shared face are noded apart, slivers between them stay empty.
+    loose = shapely.union_all([bridges, dangles]).difference(filled.buffer(nearness))
+    return filled, loose
+
+
+def _joined(points: Float[np.ndarray, "k 2"], nearness: float) -> Float[np.ndarray, "k 2"]:
+    """The points, each replaced by the first of those that are within `nearness` of each other."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(points).query_pairs(nearness, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    _, group = connected_components(links, directed=False)
+    _, first = np.unique(group, return_index=True)
+    return points[first[group]]
+
+
+def _check_apart(loops: list[shapely.Polygon], blame: str | Path) -> None:
+    """Refuse pieces that touch: at a point or an edge seen end on, nobody knows what is solid."""
+    for index, piece in enumerate(loops):
+        for other in loops[:index]:
+            if piece.touches(other):
+                place = piece.intersection(other).representative_point()
                 raise OutlineError(
                     blame,
-                    f"the mesh crosses itself in the cut at ({place.x:.4g}, {place.y:.4g}) m",
-                    remedy,
+                    f"the mesh crosses or touches itself in the cut at ({place.x:.4g},"
+                    f" {place.y:.4g}) m",
+                    "repair the mesh (unite its bodies) or cut elsewhere",
                 )
 
 
@@ -259,5 +256,9 @@ def _recesses_closed(polygon: shapely.Polygon, steepest: float = 15.0) -> shapel
 
 
 def _open_edges(mesh: trimesh.Trimesh) -> int:
-    _, counts = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
-    return int((counts != 2).sum())
+    """Edges of one face only, faces that are given twice or have no area left out."""
+    faces = np.unique(np.sort(mesh.faces, axis=1), axis=0)
+    faces = faces[(np.diff(faces, axis=1) > 0).all(axis=1)]
+    edges = np.concatenate((faces[:, :2], faces[:, 1:], faces[:, ::2]))
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    return int((counts == 1).sum())

@@ -13,11 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from tpcd.errors import OutlineError
+from tpcd.files import decoded
+from tpcd.shape.mesh import MESH_ENDINGS, load_mesh
 from tpcd.shape.outline import METRES_PER_UNIT, Outline, make_outline
-from tpcd.shape.section import MESH_ENDINGS, CuttingPlane, cut_mesh, load_mesh
+from tpcd.shape.section import CuttingPlane, cut_mesh
 from tpcd.shape.svg import load_svg
 
 SEPARATOR = re.compile(r"[,;\t ]+")
+WIDE_SEPARATOR = re.compile(r"[;\t ]+")
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,?\d+([eE][-+]?\d+)?")
 
 
 def load_outlines(
@@ -87,22 +91,23 @@ def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
     """The polygon of a `.csv` file: one vertex `x, z` per row, named after the file.
 
     A first row without numbers is a header; empty rows and rows that start with # are skipped.
+    Numbers may have decimal commas where something else parts them (`0,03; 0,02`).
 
     Raises:
-        OutlineError: missing, no text, a row that is not two numbers (with its line), or a
+        OutlineError: missing, a row that is not two numbers (with its line), or a
             polygon that is no outline.
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = decoded(path.read_bytes()).splitlines()
     except FileNotFoundError:
         raise OutlineError(path, "not found", "give a .csv file of x, z rows") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise OutlineError(path, f"not readable as text ({error})", "give x, z rows") from None
     points: list[list[float]] = []
     header_seen = False
     for number, line in enumerate(lines, start=1):
-        fields = [field for field in SEPARATOR.split(line.strip()) if field]
+        fields = _fields(line)
         if not fields or fields[0].startswith("#"):
             continue
         try:
@@ -115,9 +120,20 @@ def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
             header_seen = True
             continue
         if len(row) != 2:
-            raise OutlineError(path, f"line {number} has {len(row)} numbers", "expected x, z")
+            expected = "expected x, z"
+            if len(row) == 4 and line.count(",") == 3:
+                expected += "; with decimal commas, part x and z by a semicolon"
+            raise OutlineError(path, f"line {number} has {len(row)} numbers", expected)
         points.append(row)
     if not points:
         raise OutlineError(path, "holds no vertices", "expected one x, z row for each")
     scaled = np.array(points) * METRES_PER_UNIT[unit]
     return make_outline(path.stem, scaled, path=path, source=path.name)
+
+
+def _fields(line: str) -> list[str]:
+    """What stands between separators: semicolons, tabs or blanks, else commas."""
+    parts = [part.strip().rstrip(",") for part in WIDE_SEPARATOR.split(line.strip()) if part]
+    if len(parts) == 2 and all(DECIMAL_COMMA.fullmatch(part) for part in parts):
+        return [part.replace(",", ".") for part in parts]
+    return [field for field in SEPARATOR.split(line.strip()) if field]

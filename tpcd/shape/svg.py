@@ -34,10 +34,15 @@ METRES_PER_PIXEL = 0.0254 / 96
 PIXELS_PER_UNIT = {"": 1.0, "px": 1.0, "pt": 96 / 72, "pc": 16.0} | {
     unit: metres / METRES_PER_PIXEL for unit, metres in METRES_PER_UNIT.items() if unit != "m"
 }
+ALIGNED = {"Min": 0.0, "Mid": 0.5, "Max": 1.0}
+"""Share of the room that is left before a viewBox, by preserveAspectRatio."""
 PHYSICAL_UNITS = ("mm", "cm", "in", "pt", "pc")
 LENGTH = re.compile(rf"\s*({NUMBER.pattern})\s*([a-zA-Z%]*)\s*$")
 TRANSFORM = re.compile(r"\s*,?\s*([a-zA-Z]+)\s*\(([^)]*)\)")
 SHAPES = ("path", "polygon", "polyline", "rect", "circle", "ellipse")
+HIDDEN = re.compile(r"display\s*:\s*none|visibility\s*:\s*(hidden|collapse)")
+STYLED = re.compile(HIDDEN.pattern + r"|(?<![\w-])(transform|width|height|r|rx|ry|x|y|cx|cy|d)\s*:")
+"""What a style sheet says that would change which shapes there are, or where."""
 NOT_DRAWN = ("defs", "clipPath", "mask", "symbol", "pattern", "marker", "metadata")
 
 
@@ -71,17 +76,33 @@ def load_svg(
         raise OutlineError(path, *str(error).split("; ", 1)) from None
     if not shapes:
         raise OutlineError(path, "holds no shapes", f"expected one of {', '.join(SHAPES)}")
+    drawn = [(name, [flatten(loop, tolerance) for loop in loops]) for name, loops in shapes]
+    solid = [(name, loops) for name, loops in drawn if any(map(_has_area, loops))]
+    lines = len(drawn) - len(solid)
     outlines: dict[str, Outline] = {}
-    for index, (name, subpaths) in enumerate(shapes):
-        name = name or (path.stem if len(shapes) == 1 else f"{path.stem}-{index + 1}")
+    for index, (name, loops) in enumerate(solid or drawn):
+        name = name or (path.stem if len(solid) == 1 else f"{path.stem}-{index + 1}")
         if name in outlines:
             name = f"{name}-{index + 1}"
-        points = _outer_loop(path, name, [flatten(loop, tolerance) for loop in subpaths])
-        inside = len(subpaths) - 1
-        loops = "1 loop" if inside == 1 else f"{inside} loops"
-        notes = f"{loops} inside the outer one, taken for filled" if inside else ""
-        outlines[name] = make_outline(name, points, path=path, source=path.name, notes=notes)
+        points = _outer_loop(path, name, loops)
+        notes = [f"{_counted(len(loops) - 1, 'loop')} inside the outer one, taken for filled"]
+        notes = notes if len(loops) > 1 else []
+        if lines and not outlines:
+            notes.append(f"{_counted(lines, 'line')} without an area left out")
+        outlines[name] = make_outline(
+            name, points, path=path, source=path.name, notes="; ".join(notes)
+        )
     return outlines
+
+
+def _has_area(loop: np.ndarray) -> bool:
+    """Whether the points of a loop do not lie on a line; guides and axes do."""
+    spans = np.linalg.svd(loop - loop.mean(0), compute_uv=False) if len(loop) > 2 else (0.0, 0.0)
+    return bool(spans[1] > 1e-6 * spans[0])
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def _outer_loop(path: Path, name: str, loops: list[np.ndarray]) -> np.ndarray:
@@ -119,31 +140,73 @@ def _user_to_metres(root: ElementTree.Element, unit: str | None) -> np.ndarray:
     metres = [
         float(size[1]) * PIXELS_PER_UNIT[size[2]] * METRES_PER_PIXEL for size in sizes if size
     ]
-    view = [float(value) for value in NUMBER.findall(root.get("viewBox", ""))]
-    if not view:
+    if not root.get("viewBox"):
         return np.array([[METRES_PER_PIXEL, 0, 0], [0, -METRES_PER_PIXEL, 0]])
-    if len(view) != 4 or min(view[2:]) <= 0 or min(metres) <= 0:
+    if min(metres) <= 0:
+        raise ValueError("its width and height are not positive; give its size")
+    return _chain(np.array([[1.0, 0, 0], [0, -1.0, 0]]), _viewport(root, metres[0], metres[1]))
+
+
+def _viewport(element: ElementTree.Element, width: float, height: float) -> np.ndarray:
+    """Affine map (2, 3) from the coordinates of a viewBox to a viewport of some size (SVG 2, 8.2);
+    the identity without a viewBox."""
+    text = element.get("viewBox")
+    if not text:
+        return np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    view = np.array([float(value) for value in NUMBER.findall(text)])
+    if len(view) != 4 or min(view[2:]) <= 0:
         raise ValueError(
-            f"its viewBox '{root.get('viewBox')}' has no size; "
-            "expected four numbers 'x y width height'"
+            f"its viewBox '{text}' has no size; expected four numbers 'x y width height'"
         )
-    x_scale, y_scale = metres[0] / view[2], metres[1] / view[3]
-    if root.get("preserveAspectRatio", "").strip() != "none":
-        x_scale = y_scale = min(x_scale, y_scale)
-    return np.array([[x_scale, 0, 0], [0, -y_scale, 0]])
+    scale = np.array([width, height]) / view[2:]
+    align, _, meet = (element.get("preserveAspectRatio") or "xMidYMid").strip().partition(" ")
+    shift = np.zeros(2)
+    if align != "none":
+        scale[:] = scale.max() if meet.strip() == "slice" else scale.min()
+        if align[1:4] not in ALIGNED or align[5:] not in ALIGNED:
+            raise ValueError(f"preserveAspectRatio '{align}' is unknown; see SVG 2, 8.6")
+        part = np.array([ALIGNED[align[1:4]], ALIGNED[align[5:]]])
+        shift = part * (np.array([width, height]) - scale * view[2:])
+    return np.column_stack((np.diag(scale), shift - scale * view[:2]))
+
+
+def _nested(element: ElementTree.Element, around: tuple[float, float]) -> tuple[np.ndarray, tuple]:
+    """Map from the user units in an inner <svg> to those around it, and the size of its viewport in
+    the new units; `around` is the size of the viewport that it stands in."""
+    x, y, width, height = (
+        _length(element, key, whole, default)
+        for key, whole, default in zip(
+            ("x", "y", "width", "height"), around * 2, ("0", "0", "100%", "100%"), strict=True
+        )
+    )
+    if min(width, height) <= 0:
+        raise ValueError("an inner <svg> has no width or height; expected a size")
+    view = _viewport(element, width, height)
+    size = (width / view[0, 0], height / view[1, 1])
+    return _chain(np.array([[1.0, 0, x], [0, 1.0, y]]), view), size
 
 
 def _shapes(
-    element: ElementTree.Element, matrix: np.ndarray
+    element: ElementTree.Element, matrix: np.ndarray, around: tuple[float, float] | None = None
 ) -> Iterator[tuple[str, list[Segments]]]:
     """Name and subpaths, mapped by `matrix`, of every shape at or below an element."""
-    tag = _tag(element)
-    if tag in NOT_DRAWN or "display:none" in element.get("style", "").replace(" ", ""):
+    tag, style = _tag(element), element.get("style", "").replace(" ", "")
+    if tag in NOT_DRAWN or HIDDEN.search(style) or element.get("display") == "none":
         return
-    if element.get("display") == "none":
+    if element.get("visibility") in ("hidden", "collapse"):
         return
     if tag == "use":
         raise ValueError("it holds a <use> clone; turn clones into paths before exporting")
+    if "transform:" in style or (tag == "style" and STYLED.search(element.text or "")):
+        raise ValueError(
+            "a style hides, moves or sizes shapes; export it as plain SVG (presentation attributes)"
+        )
+    if around is None:  # the root
+        view = [float(value) for value in NUMBER.findall(element.get("viewBox", ""))]
+        around = (view[2], view[3]) if len(view) == 4 else (math.nan, math.nan)
+    elif tag == "svg":
+        inner, around = _nested(element, around)
+        matrix = _chain(matrix, inner)
     matrix = _chain(matrix, _transform(element.get("transform", "")))
     if tag in SHAPES:
         try:
@@ -156,7 +219,7 @@ def _shapes(
             yield element.get("id", ""), moved
         return
     for child in element:
-        yield from _shapes(child, matrix)
+        yield from _shapes(child, matrix, around)
 
 
 def _subpaths(tag: str, element: ElementTree.Element) -> list[Segments]:
@@ -195,9 +258,14 @@ def _rectangle(element: ElementTree.Element) -> Segments:
     return segments
 
 
-def _length(element: ElementTree.Element, key: str) -> float:
-    text = element.get(key, "0")
+def _length(
+    element: ElementTree.Element, key: str, whole: float = math.nan, default: str = "0"
+) -> float:
+    """A length in user units; percent are of `whole`."""
+    text = element.get(key, default)
     match = LENGTH.match(text)
+    if match and match[2] == "%" and math.isfinite(whole):
+        return float(match[1]) / 100 * whole
     if not match or match[2] not in PIXELS_PER_UNIT:
         raise ValueError(f"{key}='{text}' is no length; expected a number")
     return float(match[1]) * PIXELS_PER_UNIT[match[2]]

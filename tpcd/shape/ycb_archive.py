@@ -239,10 +239,10 @@ def write_manifest(folder: Path, manifest: dict[str, Record]) -> None:
 
 def _views(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Main outline of a mesh, and its side and top views by name."""
+    from tpcd.shape.mesh import load_mesh
     from tpcd.shape.section import (
         CuttingPlane,
         cut_mesh,
-        load_mesh,
         mesh_silhouette,
         upright_plane,
     )

@@ -179,7 +179,7 @@ def _loops(mesh: trimesh.Trimesh, plane: CuttingPlane, blame: str | Path) -> lis
         flat = (pieces - plane.origin) @ np.stack((across, up), axis=1)
         for nearness in NEIGHBOURS:
             filled, loose = _enclosed(flat, GRID + nearness * size)
-            if not filled.is_empty and loose.is_empty:
+            if shapely.is_empty(loose) and not shapely.is_empty(filled):
                 loops = list(getattr(filled, "geoms", [filled]))
                 _check_apart(loops, blame)
                 return loops

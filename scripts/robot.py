@@ -108,6 +108,8 @@ MAY_CHANGE = (
 
 def explore_with_robot(config: Experiment) -> None:
     """Explore an object with a UR arm and write belief, episode and raw readings to a folder."""
+    import signal
+
     import torch
 
     from tpcd.commands.exploring import EPISODE_NAME, Stage, explore_in_folder
@@ -116,6 +118,9 @@ def explore_with_robot(config: Experiment) -> None:
     from tpcd.robot.ur import FRAME_FILE, UniversalRobot
 
     torch.set_num_threads(1)
+    for number in (signal.SIGTERM, signal.SIGHUP):  # As Ctrl-C: the arm is seen to first.
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
     settings = _settings(config)
     commands = None if config.commands is None else _commands(config.commands)
     if commands is not None:

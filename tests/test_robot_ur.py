@@ -142,7 +142,7 @@ def test_ctrl_c_in_a_move_retreats_and_keeps_it(emulator, tmp_path: Path) -> Non
         x, z, _ = arm.start().poses[0].tolist()
 
         def interrupt() -> None:
-            while arm._row == 0 or len(arm._raw) < 20:
+            while arm._guard.row == 0 or len(arm._guard.servo.record) < 20:
                 time.sleep(0.002)
             os.kill(os.getpid(), signal.SIGINT)
 

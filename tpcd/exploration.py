@@ -26,7 +26,7 @@ from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
 from tpcd.policies.protocol import Choice, Policy, Situation
 from tpcd.random import stream
-from tpcd.robot.protocol import Robot
+from tpcd.robot.protocol import Robot, stopped_first
 from tpcd.shape.protocol import Shape
 
 _POLICY_STREAM, _PRIOR_STREAM = 1, 2
@@ -115,33 +115,35 @@ def explore(
 
     With `episode`, `belief` and `state` of an exploration that was stopped it goes on after
     their rows, with the very choices it would have made; rows that were measured but not yet
-    learnt from come first. `on_row` is given all rows as soon as the last one is measured. Raises
-    ValueError where no particle can explain what was measured.
+    learnt from come first. `on_row` is given all rows as soon as the last one is measured. Whatever
+    fails, the robot is stopped first. Raises ValueError where no particle can explain what was
+    measured.
     """
     generator = torch.Generator().manual_seed(seed)
-    if episode is None:
-        episode = robot.start()
-    else:
-        robot.resume(episode)
-        learnt = 0 if state is None else state.index
-        if learnt < len(episode) - 1:
-            for step in estimator.steps(episode, generator, state):
-                belief, state = step.belief, step.state
-                done = episode.first(step.index + 1)
-                yield ExplorationStep(Choice(done.commands[-1]), 0.0, True, step, done)
-    if belief is None:
-        belief = estimator.before(episode, stream(seed, _PRIOR_STREAM))
-    while True:
-        row = len(episode)
-        started = time.perf_counter()
-        choice = policy.choose(Situation(episode, belief), stream(seed, _POLICY_STREAM, row))
-        seconds = time.perf_counter() - started
-        if choice.gain is not None and choice.gain < least_gain and not choice.forced:
-            return
-        reading = robot.settle(choice.command)
-        episode = episode.with_row(choice.command, reading.pose, reading.wrench)
-        if on_row is not None:
-            on_row(episode)
-        (step,) = estimator.steps(episode, generator, state)
-        belief, state = step.belief, step.state
-        yield ExplorationStep(choice, seconds, reading.settled, step, episode)
+    with stopped_first(robot.stop):
+        if episode is None:
+            episode = robot.start()
+        else:
+            robot.resume(episode)
+            learnt = 0 if state is None else state.index
+            if learnt < len(episode) - 1:
+                for step in estimator.steps(episode, generator, state):
+                    belief, state = step.belief, step.state
+                    done = episode.first(step.index + 1)
+                    yield ExplorationStep(Choice(done.commands[-1]), 0.0, True, step, done)
+        if belief is None:
+            belief = estimator.before(episode, stream(seed, _PRIOR_STREAM))
+        while True:
+            row = len(episode)
+            started = time.perf_counter()
+            choice = policy.choose(Situation(episode, belief), stream(seed, _POLICY_STREAM, row))
+            seconds = time.perf_counter() - started
+            if choice.gain is not None and choice.gain < least_gain and not choice.forced:
+                return
+            reading = robot.settle(choice.command)
+            episode = episode.with_row(choice.command, reading.pose, reading.wrench)
+            if on_row is not None:
+                on_row(episode)
+            (step,) = estimator.steps(episode, generator, state)
+            belief, state = step.belief, step.state
+            yield ExplorationStep(choice, seconds, reading.settled, step, episode)

@@ -15,6 +15,7 @@ from tpcd.data.episode import Episode
 from tpcd.exploration import Closing, ExplorationStep
 from tpcd.policies.active import Task
 from tpcd.predict import ContactPredictor
+from tpcd.robot.protocol import stopped_first
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def run_exploration(
 
     What an earlier run has `kept` in the folder stays, and `steps` come after it; where that is
     enough already, only what ends a run is missing. `let_go` is called once no more moves come,
-    before the closing draws.
+    before the closing draws, and before all else where something fails.
     """
     kept = kept or Kept()
 
@@ -84,9 +85,12 @@ def run_exploration(
         return belief, episode, stopping.closed_reason(reason, belief, task)
 
     total, episode = stopping.steps, kept.episode
-    with EstimationRun(
-        folder, prior_name, total, kept.state, show_progress, closing, kept.belief
-    ) as run:
+    with (
+        EstimationRun(
+            folder, prior_name, total, kept.state, show_progress, closing, kept.belief
+        ) as run,
+        stopped_first(let_go),
+    ):
         moves = 0 if kept.state is None else kept.state.index
         if episode is not None and kept.belief is not None and moves == len(episode) - 1:
             reason = stopping.reason(kept.belief, moves, task)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -12,6 +13,7 @@ from tpcd.belief import EstimatorSettings
 from tpcd.belief.belief import Belief
 from tpcd.belief.state import load_state
 from tpcd.belief.storage import load_belief
+from tpcd.cli_messages import system_problem
 from tpcd.commands.drawing import KnownTruth
 from tpcd.commands.exploration_run import Kept, Stopping, run_exploration
 from tpcd.commands.exploring_options import ExploringOptions
@@ -25,7 +27,7 @@ from tpcd.policies import Limits
 from tpcd.policies.active import Task
 from tpcd.policies.protocol import Policy
 from tpcd.results import RESULTS_FILE, format_table, resumed_run, run_folder, write_results
-from tpcd.robot.protocol import Robot
+from tpcd.robot.protocol import Robot, stopped_first
 from tpcd.shape.checkpoint import load_prior
 
 EPISODE_NAME = "explore"
@@ -92,31 +94,27 @@ def explore_in_folder(
             lambda rows: write_together(on_stage.contents(rows)),
             options.stop_gain or 0.0,
         )
+        robot = on_stage.robot
         try:
-            belief, episode, reason = run_exploration(
-                steps,
-                Stopping(options.steps, options.stop_error),
-                options.prior,
-                folder,
-                kept,
-                task,
-                on_stage.truth,
-                estimator.closing,
-                on_stage.robot.stop,
-            )
-        except RobotError as error:
+            with closing(robot), stopped_first(robot.stop):
+                belief, episode, reason = run_exploration(
+                    steps,
+                    Stopping(options.steps, options.stop_error),
+                    options.prior,
+                    folder,
+                    kept,
+                    task,
+                    on_stage.truth,
+                    estimator.closing,
+                    robot.stop,
+                )
+        except (RobotError, OSError) as error:
             hint = f"; {options.out} goes on with --resume"
-            kept = error.resumable and (folder / resumable).is_file()
-            raise RobotError(f"{error}{hint if kept else ''}") from error
+            goes_on = getattr(error, "resumable", True) and (folder / resumable).is_file()
+            raise RobotError(f"{_told(error, robot)}{hint if goes_on else ''}") from error
         except KeyboardInterrupt as stop:
-            on_stage.robot.stop()
-            where = getattr(on_stage.robot, "at_rest", None)
+            where = getattr(robot, "at_rest", None)
             raise KeyboardInterrupt(*([where] if where else [])) from stop
-        finally:
-            try:
-                on_stage.robot.stop()
-            finally:
-                on_stage.robot.close()
         _finish(options, folder, belief, episode, reason, on_stage.truth)
 
 
@@ -146,6 +144,14 @@ def _finish(
         f"results in {options.out}; next: python scripts/predict.py {quote(str(options.out))}"
         " EPISODE --out FILE.csv"
     )
+
+
+def _told(error: Exception, robot: Robot) -> str:
+    """What failed, and how the arm was left."""
+    if isinstance(error, OSError):
+        where = getattr(robot, "at_rest", None)
+        return system_problem(error) + (f"; {where}" if where else "")
+    return str(error)
 
 
 def _kept(folder: Path, estimator: Estimator, prior: str) -> Kept:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,13 +90,14 @@ class Link:
     def next_sample(self) -> Sample:
         """Wait for the next reading; raises RobotError once the link or the arm has stopped."""
         deadline = time.monotonic() + self.stale_time
+        receive = self._receive
         while True:
-            stamp = self._receive.getTimestamp()
+            stamp = self._ask(receive.getTimestamp)
             if stamp != self._last:
                 break
             if time.monotonic() > deadline:
                 self.alive = False
-                connected = "the connection stands" if self._receive.isConnected() else "it is cut"
+                connected = "the connection stands" if receive.isConnected() else "it is cut"
                 raise RobotError(
                     f"{self.address}: no new reading for {1e3 * self.stale_time:.0f} ms"
                     f" ({connected}); the arm holds its last target: see to it, then to network and"
@@ -106,30 +108,30 @@ class Link:
         self._check_safety()
         return Sample(
             stamp,
-            np.array(self._receive.getActualTCPPose()),
-            np.array(self._receive.getActualTCPForce()),
-            np.array(self._receive.getTargetTCPPose()),
+            np.array(self._ask(receive.getActualTCPPose)),
+            np.array(self._ask(receive.getActualTCPForce)),
+            np.array(self._ask(receive.getTargetTCPPose)),
             time.monotonic(),
         )
 
     def payload(self) -> float:
         """Mass that the controller was told it carries [kg]."""
-        return float(self._receive.getPayload())
+        return float(self._ask(self._receive.getPayload))
 
     def servo(self, target: Float[np.ndarray, " 6"]) -> None:
         """Give the servo its next target, a TCP pose in the base frame."""
         timing = (1.0 / self.rate, LOOK_AHEAD, GAIN)
-        self._done(self._control.servoL(target.tolist(), 0.0, 0.0, *timing), "servoL")
+        self._do(self._control.servoL, target.tolist(), 0.0, 0.0, *timing)
 
     def zero_sensor(self) -> None:
         """Take the present wrench for zero."""
         if self.alive:
-            self._done(self._control.zeroFtSensor(), "zeroFtSensor")
+            self._do(self._control.zeroFtSensor)
 
     def stop(self) -> None:
         """End the servo; the arm holds where it is. Nothing where the link is lost."""
-        if self.alive and self._control.isProgramRunning():
-            self._done(self._control.servoStop(), "servoStop")
+        if self.alive and self._ask(self._control.isProgramRunning):
+            self._do(self._control.servoStop)
 
     def disconnect(self) -> None:
         """End script and connections; never raises, takes up to 6 s where the link is lost."""
@@ -147,7 +149,7 @@ class Link:
     @property
     def stopped_for_safety(self) -> str | None:
         """Why the safety system keeps the arm from moving; None where it does not."""
-        bits = int(self._receive.getSafetyStatusBits())
+        bits = int(self._ask(self._receive.getSafetyStatusBits))
         found = [name for bit, name in SAFETY_STOPS.items() if bits >> bit & 1]
         return found[0] if found else None
 
@@ -159,15 +161,27 @@ class Link:
                 f"{self.address}: {reason}; see to the arm and clear it on the teach pendant"
             )
 
-    def _done(self, answer: bool, command: str) -> None:
-        if answer:
+    def _ask(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        """What the client answers; an error of the client is a link that is lost."""
+        try:
+            return call(*arguments)
+        except RuntimeError as error:
+            self.alive = False
+            raise RobotError(
+                f"{self.address}: {call.__name__} failed ({' '.join(str(error).split())}); the arm"
+                " holds its last target: see to it, then to network and controller"
+            ) from error
+
+    def _do(self, call: Callable[..., Any], *arguments: Any) -> None:
+        """Give a command; raises RobotError where it is refused."""
+        if self._ask(call, *arguments):
             return
         self._check_safety()
         self.alive = False
-        running = "runs" if self._control.isProgramRunning() else "has ended"
+        running = "runs" if self._ask(self._control.isProgramRunning) else "has ended"
         raise RobotError(
-            f"{self.address}: {command} was refused, the control script {running}; look at the"
-            " teach pendant's log"
+            f"{self.address}: {call.__name__} was refused, the control script {running}; look at"
+            " the teach pendant's log"
         )
 
 

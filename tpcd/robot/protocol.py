@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -50,3 +52,19 @@ class Robot(Protocol):
     def close(self) -> None:
         """Let go of the arm."""
         ...
+
+
+@contextmanager
+def stopped_first(stop: Callable[[], None]) -> Iterator[None]:
+    """A block whose failure stops the arm before anybody writes, draws or tells.
+
+    The arm may press on something between two moves, so also what fails then ends in its retreat.
+    Closing a generator is no failure.
+    """
+    try:
+        yield
+    except GeneratorExit:
+        raise
+    except BaseException:
+        stop()
+        raise

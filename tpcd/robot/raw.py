@@ -1,9 +1,9 @@
 """All readings of a move, in Parquet beside the episode: `raw/row_007.parquet` for row 7.
 
-A file for each row, written as soon as the move ends however it ends, so that nothing is lost; a
-move that is made again after a stop gets a file of its own, `row_007-2.parquet`. Its metadata name
-the row, the command and how the move ended. Columns: stamp and time of receipt [s], TCP pose and
-target in the base frame, wrench along base axes, and what the task sees of them.
+A file for each row, written as soon as the arm is at rest, however the move ended, so that nothing
+is lost; a move that is made again after a stop gets a file of its own, `row_007-2.parquet`. Its
+metadata name the row, the command and how the move ended. Columns: stamp and time of receipt [s],
+TCP pose and target in the base frame, wrench along base axes, and what the task sees of them.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from tpcd.errors import FileError
 from tpcd.robot.link import Sample
 
 BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -62,9 +63,10 @@ class RawRecord:
         self._rows.append(np.concatenate(parts))
 
     def write(self, folder: Path, name: str, about: Mapping[str, Any]) -> Path | None:
-        """Write NAME.parquet in one move and start anew; None where nothing was read.
+        """Write NAME.parquet in one move; None where nothing was read.
 
-        A file of that name stays, and this one becomes NAME-2, NAME-3, ...
+        A file of that name stays, and this one becomes NAME-2, NAME-3, ... Raises FileError where
+        it cannot be written; the readings stay.
         """
         if not self._rows:
             return None
@@ -72,18 +74,21 @@ class RawRecord:
         import pyarrow.parquet
 
         table = np.array(self._rows)
-        self._rows = []
         content = pyarrow.table({key: table[:, i] for i, key in enumerate(COLUMNS)})
         content = content.replace_schema_metadata({"tpcd": json.dumps(dict(about))})
-        folder.mkdir(parents=True, exist_ok=True)
         path, count = folder / f"{name}.parquet", 1
-        while path.exists():
-            count += 1
-            path = folder / f"{name}-{count}.parquet"
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
-            pyarrow.parquet.write_table(content, temporary)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
+            while path.exists():
+                count += 1
+                path = folder / f"{name}-{count}.parquet"
+            temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+            try:
+                pyarrow.parquet.write_table(content, temporary)
+                os.replace(temporary, path)
+            finally:
+                temporary.unlink(missing_ok=True)
+        except OSError as error:
+            problem = f"cannot be written: {error.strerror or error}"
+            raise FileError(path, problem, "see to the disk") from error
         return path

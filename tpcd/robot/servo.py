@@ -7,6 +7,7 @@ recorded, whatever the arm is doing.
 from __future__ import annotations
 
 from collections import deque
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.command_way import command_way, moved_on
 from tpcd.robot.frames import TaskFrame, planar_pose, planar_wrench
 from tpcd.robot.frames import tcp_pose as tcp_of
+from tpcd.robot.held_signals import HeldSignals
 from tpcd.robot.link import Link, Sample
 from tpcd.robot.preflight import FreeAir
 from tpcd.robot.protocol import Reading
@@ -57,9 +59,22 @@ LARGEST_STEP = 0.05
 class Servo:
     """The loop from reading to target of one connected arm, in its task frame."""
 
-    def __init__(self, settings: ArmSettings, link: Link, frame: TaskFrame, raw: RawRecord) -> None:
-        """An arm that is only read, until `state` is set."""
-        self.settings, self.link, self.frame, self._raw = settings, link, frame, raw
+    def __init__(
+        self,
+        settings: ArmSettings,
+        link: Link,
+        frame: TaskFrame,
+        record: RawRecord,
+        signals: HeldSignals | None = None,
+    ) -> None:
+        """An arm that is only read, until `state` is set. Signals that `signals` holds are looked
+        at with each reading."""
+        self.settings, self.link, self.frame = settings, link, frame
+        self.record = record
+        """Of the present move."""
+        self._signals = signals or HeldSignals()
+        self.halted = False
+        """Whether nothing may move the arm any more but its retreat."""
         self._law, self.settling = settings.admittance, SettlingSettings()
         self.state: AdmittanceState | None = None
         """Where the arm is sent; None while it is only read."""
@@ -73,11 +88,14 @@ class Servo:
 
     def read(self) -> tuple[Sample, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """The next reading, checked and recorded."""
+        self._signals.look()
         frame, state = self.frame, self.state
         sample = self.link.next_sample()
         pose, wrench = planar_pose(frame, sample.tcp), planar_wrench(frame, sample.wrench)
         reference = pose if state is None else state.reference
-        self._raw.add(sample, pose, wrench, reference)
+        # What cannot be kept ends a move, and no retreat.
+        with suppress(Exception) if self._retreating else nullcontext():
+            self.record.add(sample, pose, wrench, reference)
         self._felt.append(np.abs(wrench[:2]))
         limit = self.settings.stop_force * np.array([1.0, 1.0, 0.2])
         over = bool((np.abs(wrench) > limit).any()) and not self._retreating
@@ -99,11 +117,11 @@ class Servo:
     def stand(self, seconds: float) -> FreeAir:
         """Readings of an arm that is not moved."""
         rows: list[np.ndarray] = []
-        frame, state = self.frame, self.state
+        state = self.state
         while not rows or rows[-1][0] - rows[0][0] < seconds:
             sample, pose, wrench = self.read()
             if state is not None:
-                self.link.servo(tcp_of(frame, state.reference))
+                self._send(state.reference)
             rows.append(np.concatenate(([sample.stamp], pose, wrench)))
         table = np.array(rows)
         return FreeAir(table[:, 0], table[:, 1:4], table[:, 4:7])
@@ -116,10 +134,9 @@ class Servo:
     ) -> None:
         """Straight to a pose; RobotError where a force grows by more than `allowed` [N] beyond what
         it was `before`, by default at the first reading."""
-        link, frame = self.link, self.frame
+        rate, waited = self.link.rate, 0
         self._command = None
-        waited = 0
-        while waited < 0.3 * link.rate:
+        while waited < 0.3 * rate:
             _, pose, wrench = self.read()
             state = self.state or at_rest(pose, np.zeros(3))
             force = np.abs(wrench[:2])
@@ -130,11 +147,11 @@ class Servo:
                     " what should be free air"
                 )
             way = goal - state.reference
-            steps = max(np.hypot(way[0], way[1]), abs(way[2]) / 10) / RAMP_SPEED * link.rate
+            steps = max(np.hypot(way[0], way[1]), abs(way[2]) / 10) / RAMP_SPEED * rate
             waited += steps < 1
             reference = state.reference + way / max(1.0, float(steps))
             self.state = at_rest(reference, wrench)
-            link.servo(tcp_of(frame, reference))
+            self._send(reference)
 
     def retreat(self) -> Float[np.ndarray, " 3"]:
         """Away from what may be touched, then up; the arm holds where the way is not free.
@@ -160,7 +177,7 @@ class Servo:
 
     def settle(self, command: Float[np.ndarray, " 3"]) -> Reading:
         """Give way to a command until pose and force are steady, and average them."""
-        link, frame = self.link, self.frame
+        rate = self.link.rate
         assert self.state is not None, "start first"
         window, last, began = Window(self.settling, self.noise), None, None
         law = replace(self._law, noise=tuple(self.noise.tolist()))
@@ -172,7 +189,7 @@ class Servo:
         while still is None:
             sample, pose, wrench = self.read()
             began = sample.stamp if began is None else began
-            passed = 1 / link.rate if last is None else sample.stamp - last
+            passed = 1 / rate if last is None else sample.stamp - last
             last = sample.stamp
             step = min(passed, LARGEST_STEP)
             way = moved_on(way, law, self.state, step)
@@ -181,7 +198,7 @@ class Servo:
                 began, reached = sample.stamp, way.share
             state = advance(law, self.state, way.command, wrench, step)
             self.state = state
-            link.servo(tcp_of(frame, state.reference))
+            self._send(state.reference)
             window.add(sample.stamp, pose, wrench, residual(law, state, command))
             count += 1
             if count % 12:
@@ -224,6 +241,12 @@ class Servo:
                 f"{what} is at ({shown}) [m, m, rad], outside of the workspace from"
                 f" {self.settings.workspace_low} to {self.settings.workspace_high}"
             )
+
+    def _send(self, reference: Float[np.ndarray, " 3"]) -> None:
+        """The next target of the position servo, unless the arm was stopped meanwhile."""
+        if self.halted and not self._retreating:
+            raise RobotError("the arm was told to stop")
+        self.link.servo(tcp_of(self.frame, reference))
 
 
 def tensor_of(values: np.ndarray) -> Tensor:

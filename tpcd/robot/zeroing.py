@@ -1,0 +1,113 @@
+"""Zero means free: the sensor is zeroed in the air, away from floor and wall.
+
+What a sensor carries when it is zeroed is missing from all that it says afterwards. So it is zeroed
+lifted: above where the arm starts and to the left, since the world has a floor below and a wall on
+the right, and along a wall a way straight up rubs. What lifting changes, beyond noise and drift, is
+contact: gravity, the sensor's offset and a wrong payload stay as they are where the tool does not
+turn. After zeroing the arm goes back to the start, which must read zero there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tpcd.errors import RobotError
+from tpcd.robot import preflight
+from tpcd.robot.admittance import at_rest
+from tpcd.robot.arm_settings import ArmSettings
+from tpcd.robot.preflight import FreeAir
+from tpcd.robot.servo import RETREAT_FORCE, Servo
+
+SPARE = 0.002
+"""Way beyond what a surface yields, after which an arm that was lifted is free [m]."""
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """What lifting an arm from a place has told."""
+
+    start: Float[np.ndarray, " 3"]
+    """The place [m, m, rad]."""
+    touch: preflight.Touch
+    """What is felt there."""
+
+
+def lifted(settings: ArmSettings, start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """The pose above a start pose and to its left at which the sensor is zeroed [m, m, rad], as
+    far as the workspace allows."""
+    low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
+    least = _least_way(settings)
+    way = np.array([-max(0.5 * settings.retreat, least), max(settings.retreat, least), 0.0])
+    return np.clip(start + way, np.minimum(low, start), np.maximum(high, start))
+
+
+def check_room(settings: ArmSettings, start: Float[np.ndarray, " 3"]) -> None:
+    """Raises RobotError where the workspace leaves too little way to leave a surface that yields as
+    stated under the largest force before zeroing."""
+    room, least = np.abs(lifted(settings, start) - start)[:2], _least_way(settings)
+    if float(room.min()) < least - 1e-9:
+        shown = ", ".join(f"{value:.3f}" for value in start)
+        raise RobotError(
+            f"the start pose is at ({shown}) [m, m, rad], where the workspace leaves"
+            f" {1e3 * room[0]:.0f} mm to the left and {1e3 * room[1]:.0f} mm above, expected"
+            f" {1e3 * least:.0f} mm of both, to zero the sensor free of contact; start elsewhere,"
+            " or widen the workspace"
+        )
+
+
+def lift(servo: Servo) -> Lifted:
+    """Lift an arm from where it stands, with its sensor as it is, and compare.
+
+    Also measures the noise of single readings. Raises RobotError for a sensor that drifts.
+    """
+    here = servo.stand(servo.settling.window)
+    preflight.check_before_zeroing(here)
+    start = here.poses.mean(0)
+    above = lifted(servo.settings, start)
+    servo.state = at_rest(start, np.zeros(3))
+    servo.ramp_to(above, RETREAT_FORCE)
+    air = servo.stand(servo.settings.still_time)
+    preflight.check_drift(air)
+    servo.noise = preflight.reading_noise(air)
+    return Lifted(start, preflight.touch(here, air))
+
+
+def turning_force(servo: Servo) -> float:
+    """Zero in the air, tilt the tool both ways and back: the force that turns with it, each way
+    [N]; raises RobotError for a wrong payload."""
+    assert servo.state is not None, "lift first"
+    settings, here, tilted = servo.settings, servo.state.reference, []
+    servo.link.zero_sensor()
+    for limit, angle in zip(
+        (settings.workspace_low, settings.workspace_high), (-1, 1), strict=True
+    ):
+        servo.ramp_to(np.array([here[0], here[1], angle * min(abs(limit[2]), preflight.TILT)]))
+        tilted.append(servo.stand(servo.settling.window))
+    servo.ramp_to(here)
+    return preflight.check_tilted(*tilted)
+
+
+def zeroed_at(servo: Servo, start: Float[np.ndarray, " 3"]) -> tuple[FreeAir, FreeAir]:
+    """Zero in the air above a start pose, at its angle, and go down to it; the readings there,
+    above and at the start. Raises RobotError where the start then does not read zero."""
+    servo.ramp_to(lifted(servo.settings, start))
+    servo.link.zero_sensor()
+    air = servo.stand(servo.settings.still_time)
+    preflight.check_drift(air)
+    preflight.check_zeroed(air)
+    servo.ramp_to(start)
+    there = servo.stand(servo.settling.window)
+    touch = preflight.touch(there, air)
+    if touch.felt:
+        raise RobotError(
+            f"the start pose is not free: zeroed in the air, the sensor reads {touch} there; start"
+            " anew from a pose in free air"
+        )
+    return air, there
+
+
+def _least_way(settings: ArmSettings) -> float:
+    return 1e-4 * settings.surface_mm_per_10n * preflight.LARGEST_BEFORE_ZEROING + SPARE

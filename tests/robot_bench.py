@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,9 @@ import torch
 from tpcd.robot.admittance import AdmittanceSettings, at_rest
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.emulator import EmulatorSettings, emulated_frame, emulated_scene
-from tpcd.robot.emulator.controller import SERVO_L, Controller
+from tpcd.robot.emulator.controller import SERVO_L, SERVO_STOP, ZERO_SENSOR, Controller
 from tpcd.robot.emulator.process import running_emulator
+from tpcd.robot.frames import task_frame, tcp_pose
 from tpcd.robot.link import Link, Sample
 from tpcd.robot.raw import RawRecord
 from tpcd.robot.servo import Servo
@@ -99,6 +100,96 @@ class Wired(Link):
         """A target for the controller."""
         values = {f"input_double_register_{index}": v for index, v in enumerate(target.tolist())}
         self.controller.write({**values, "input_int_register_0": SERVO_L})
+
+    def zero_sensor(self) -> None:
+        """Take the present wrench for zero."""
+        self.controller._execute(ZERO_SENSOR)
+
+    def payload(self) -> float:
+        """Mass that the controller was told it carries [kg]."""
+        return self.controller.payload
+
+    def stop(self) -> None:
+        """End the servo."""
+        self.controller._execute(SERVO_STOP)
+
+    def disconnect(self) -> None:
+        """Nothing is open."""
+        self.alive = False
+
+
+class Springy(Link):
+    """An arm that is where it was told to be over a floor that is a spring, quick enough to fail in
+    every way that there is. The tool points down, at angle zero."""
+
+    def __init__(self, pose: tuple[float, float, float]) -> None:
+        self.alive, self.rate, self.time = True, 125.0, 0.0
+        self.frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
+        self.target = tcp_pose(self.frame, np.array(pose))
+        self.zero, self.sent = 0.0, 0
+
+    @property
+    def force(self) -> float:
+        """Of the floor where the arm was told to be [N]."""
+        return 2000.0 * max(0.0, float(self.frame.origin[2] - self.target[2]))
+
+    def next_sample(self) -> Sample:
+        """The reading after this one."""
+        self.time += 1 / self.rate
+        wrench = np.array([0.0, 0.0, self.force - self.zero, 0.0, 0.0, 0.0])
+        return Sample(self.time, self.target, wrench, self.target, 0.0)
+
+    def servo(self, target: np.ndarray) -> None:
+        """Where the arm is to be."""
+        self.target, self.sent = target, self.sent + 1
+
+    def zero_sensor(self) -> None:
+        """Take the present wrench for zero."""
+        self.zero = self.force
+
+    def payload(self) -> float:
+        """What it was told that it carries [kg]."""
+        return 0.5
+
+    def stop(self) -> None:
+        """Nothing to end."""
+
+    def disconnect(self) -> None:
+        """Nothing is open."""
+        self.alive = False
+
+
+def wired_arm(
+    folder: Path,
+    start: tuple[float, float, float] | None = None,
+    confirm: Callable[[str], bool] = lambda _: True,
+    arm: dict[str, Any] | None = None,
+    **changed: Any,
+) -> tuple[UniversalRobot, Controller]:
+    """An arm on a controller in this process, which stands at a start pose of the world, by default
+    the scene's, with its sensor not yet zeroed."""
+    settings = emulator_settings(**changed)
+    controller = Controller(settings)
+    if start is not None:
+        controller._target = controller._actual = np.array(start)
+        controller._delayed.extend([controller._actual] * len(controller._delayed))
+        controller._load = controller._sense()
+    stated = {"surface_mm_per_10n": settings.surface_mm_per_10n, **(arm or {})}
+    robot = arm_on(settings, folder, **stated)
+    robot._confirm, robot._link = confirm, Wired(controller, robot.settings.rate)
+    return robot, controller
+
+
+def touching(settings: EmulatorSettings, force_x: float = 0.0, force_z: float = 0.0) -> np.ndarray:
+    """The scene's start pose, moved until floor and wall, where they are to, push with a force
+    without friction [N]."""
+    scene = emulated_scene(settings)
+    pose, points = scene.start_pose.numpy().copy(), scene.vertices_ee.numpy()
+    if force_z:
+        pose[1] = scene.floor_height - points[:, 1].min() - force_z * settings.compliance
+    if force_x:
+        pose[0] = scene.wall_position - points[:, 0].max() + force_x * settings.compliance
+    return pose
 
 
 def wired_servo(law: AdmittanceSettings | None = None, **changed: Any) -> tuple[Servo, Controller]:

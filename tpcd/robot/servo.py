@@ -42,6 +42,8 @@ FOLLOWING = (0.015, 0.015, 0.1)
 """How far the arm may be from its target: the delay's way at full speed, several times over."""
 RAMP_SPEED = 0.03
 """Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
+ARRIVING = 0.3
+"""Until the arm stands where its last target was, at the end of such a move [s]."""
 RAMP_FORCE, RETREAT_FORCE = 4.0, 10.0
 """Further force that ends a move in free air, and a retreat, at whose start friction turns [N]."""
 RECENT = 0.5
@@ -136,7 +138,7 @@ class Servo:
         it was `before`, by default at the first reading."""
         rate, waited = self.link.rate, 0
         self._command = None
-        while waited < 0.3 * rate:
+        while waited < ARRIVING * rate:
             _, pose, wrench = self.read()
             state = self.state or at_rest(pose, np.zeros(3))
             force = np.abs(wrench[:2])

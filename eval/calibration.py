@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from eval.lines import append_lines, read_lines, write_line
+from eval.opened import opened_run
 from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
@@ -71,49 +72,46 @@ def calibrate(config: Calibration) -> None:
 
     from tpcd.belief.prior import make_prior
     from tpcd.figures import save_figure
-    from tpcd.results import CONFIG_FILE, continue_run, format_table, open_run, write_results
+    from tpcd.results import CONFIG_FILE, format_table, write_results
 
     torch.set_num_threads(1)
-    if (config.out / CONFIG_FILE).is_file():
-        folder = continue_run(config.out, config, free=("out", "runs"))
-    else:
-        folder = open_run(config.out, COMMAND, config)
-    shape = _shape(config)
-    lines_path = folder / RUNS_FILE
-    done = {int(line["seed"]): line for line in read_lines(lines_path)}
-    missing = [config.seed + r for r in range(config.runs) if config.seed + r not in done]
-    with append_lines(lines_path) as file:
-        for seed in tqdm(missing, desc="calibration", unit="run"):
-            done[seed] = {"seed": seed, **_one_run(config, shape, seed)}
-            write_line(file, done[seed])
-    found = [line for line in done.values() if "place" in line]
-    places = [line["place"] for line in found]
-    failed = len(done) - len(places)
-    if not places:
-        raise ValueError(f"all {failed} runs failed; see {lines_path}")
-    names = make_prior(shape).names
-    if config.estimator != "paper":
-        names = (*names, "misfit_sd")
-    table = coverage_table(places, names)
-    print(format_table(table))
-    by_misfit = []
-    if config.estimator == "likelihood":
-        # Not the misfit's own place, which its size decides.
-        theta = [place[:-1] for place in places]
-        by_misfit = coverage_by_misfit(theta, [line["misfit_score"] for line in found])
-    if by_misfit:
-        print(format_table(by_misfit))
-    print(f"{len(places)} runs, {failed} failed; limits hold 95 % of calibrated estimators")
-    where = "given all others" if config.estimator == "likelihood" else "in the posterior"
-    figure = rank_histograms(places, names, where)
-    with SummaryWriter(str(folder / "tensorboard")) as writer:
-        save_figure(figure, folder / "figures", "ranks", writer)
-        writer.add_text("table", "```\n" + format_table(table) + "\n```")
-        for row in table:
-            writer.add_scalar(f"coverage_90/{row['parameter']}", row["inside_90"])
-            writer.add_scalar(f"coverage_50/{row['parameter']}", row["inside_50"])
-    more = {"by_misfit": by_misfit} if by_misfit else {}
-    write_results(folder, table, seeds=sorted(done), runs=len(places), failed=failed, **more)
+    shape, earlier = _shape(config), (config.out / CONFIG_FILE).is_file()
+    with opened_run(config, COMMAND, ("out", "runs"), resume=earlier) as folder:
+        lines_path = folder / RUNS_FILE
+        done = {int(line["seed"]): line for line in read_lines(lines_path)}
+        missing = [config.seed + r for r in range(config.runs) if config.seed + r not in done]
+        with append_lines(lines_path) as file:
+            for seed in tqdm(missing, desc="calibration", unit="run"):
+                done[seed] = {"seed": seed, **_one_run(config, shape, seed)}
+                write_line(file, done[seed])
+        found = [line for line in done.values() if "place" in line]
+        places = [line["place"] for line in found]
+        failed = len(done) - len(places)
+        if not places:
+            raise ValueError(f"all {failed} runs failed; see {lines_path}")
+        names = make_prior(shape).names
+        if config.estimator != "paper":
+            names = (*names, "misfit_sd")
+        table = coverage_table(places, names)
+        print(format_table(table))
+        by_misfit = []
+        if config.estimator == "likelihood":
+            # Not the misfit's own place, which its size decides.
+            theta = [place[:-1] for place in places]
+            by_misfit = coverage_by_misfit(theta, [line["misfit_score"] for line in found])
+        if by_misfit:
+            print(format_table(by_misfit))
+        print(f"{len(places)} runs, {failed} failed; limits hold 95 % of calibrated estimators")
+        where = "given all others" if config.estimator == "likelihood" else "in the posterior"
+        figure = rank_histograms(places, names, where)
+        with SummaryWriter(str(folder / "tensorboard")) as writer:
+            save_figure(figure, folder / "figures", "ranks", writer)
+            writer.add_text("table", "```\n" + format_table(table) + "\n```")
+            for row in table:
+                writer.add_scalar(f"coverage_90/{row['parameter']}", row["inside_90"])
+                writer.add_scalar(f"coverage_50/{row['parameter']}", row["inside_50"])
+        more = {"by_misfit": by_misfit} if by_misfit else {}
+        write_results(folder, table, seeds=sorted(done), runs=len(places), failed=failed, **more)
 
 
 def coverage_table(places: Sequence[Sequence[float]], names: Sequence[str]) -> list[dict[str, Any]]:

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any, TextIO
 
+from tpcd.files import named
+
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """All whole lines of a file, none where it does not exist."""
@@ -30,5 +32,6 @@ def append_lines(path: Path) -> TextIO:
 
 def write_line(file: TextIO, row: dict[str, Any]) -> None:
     """One more line, at once."""
-    file.write(json.dumps(row) + "\n")
-    file.flush()
+    with named(file.name):
+        file.write(json.dumps(row) + "\n")
+        file.flush()

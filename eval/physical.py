@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from eval.opened import opened_run
 from tpcd.cli import check_numbers, run
 
 if TYPE_CHECKING:
@@ -77,24 +78,23 @@ def evaluate_physical(config: Physical) -> None:
     import torch
 
     from eval.physical_sessions import recorded
-    from tpcd.results import continue_run, format_table, open_run, write_results
+    from tpcd.results import format_table, write_results
 
     torch.set_num_threads(1)
-    if config.resume:
-        folder = continue_run(config.out, config, free=("out",))
-    else:
-        folder = open_run(config.out, "python -m eval.physical", config, config.overwrite)
-    rows: list[dict[str, Any]] = [PAPER]
-    for index, name in enumerate(config.objects):
-        episodes = recorded(config, index, folder / name)
-        rows += _rows(config, config.tiles[index], name, episodes, folder / name)
-        print(format_table(rows), flush=True)
-    ours = dict.fromkeys(row["estimator"] for row in rows[1:])
-    for estimator in ours:
-        rows.append(_mean(estimator, [row for row in rows[1:] if row["estimator"] == estimator]))
-    print(format_table(rows[-len(ours) :]))
-    log_errors(rows, folder)
-    write_results(folder, rows, seeds=[config.seed], kind="emulated, not measured on a robot")
+    with opened_run(config, "python -m eval.physical", ("out",)) as folder:
+        rows: list[dict[str, Any]] = [PAPER]
+        for index, name in enumerate(config.objects):
+            episodes = recorded(config, index, folder / name)
+            rows += _rows(config, config.tiles[index], name, episodes, folder / name)
+            print(format_table(rows), flush=True)
+        ours = dict.fromkeys(row["estimator"] for row in rows[1:])
+        for estimator in ours:
+            rows.append(
+                _mean(estimator, [row for row in rows[1:] if row["estimator"] == estimator])
+            )
+        print(format_table(rows[-len(ours) :]))
+        log_errors(rows, folder)
+        write_results(folder, rows, seeds=[config.seed], kind="emulated, not measured on a robot")
 
 
 def log_errors(rows: Sequence[dict[str, Any]], folder: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.lines import append_lines, read_lines, write_line
+from eval.opened import opened_run
 from tpcd.cli import check_numbers, run
 
 SEEN = (
@@ -98,7 +99,7 @@ def evaluate_unseen(config: Unseen) -> None:
     from tpcd.figures.quality import calibration, error_bars
     from tpcd.figures.sinks import save_figure
     from tpcd.prediction import CHANNELS
-    from tpcd.results import continue_run, format_table, open_run, write_results
+    from tpcd.results import format_table, write_results
     from tpcd.shape.checkpoint import find_prior, load_prior
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
@@ -110,44 +111,46 @@ def evaluate_unseen(config: Unseen) -> None:
     priors = {find_prior(prior).resolve().name: prior for prior in given}
     if len(priors) < len(given):
         raise ValueError(f"priors are {', '.join(given)}, expected priors of different names")
-    if config.resume:
-        folder = continue_run(config.out, config, free=("out",))
-    else:
-        folder = open_run(config.out, "python -m eval.unseen", config, config.overwrite)
-    path = folder / "cells.jsonl"
-    cells = read_lines(path)
-    plan = [(n, p, s) for s in config.seeds for n in names for p in priors]
-    done = {(c["object"], c["prior"], c["seed"]) for c in cells}
-    with append_lines(path) as lines:
-        for name, prior, seed in tqdm(plan, unit="cell", initial=0):
-            if (name, prior, seed) in done:
-                continue
-            shape = load_prior(priors[prior])
-            cell = _cell(config, name, outlines[name].vertices, prior, shape, seed)
-            write_line(lines, cell)
-            cells.append(cell)
-    columns = [key for key in cells[0] if key not in ("contact_transform", "theta_score")]
-    table = [{key: cell[key] for key in columns} for cell in cells]
-    means = _means(table, list(priors))
-    print(format_table([*table, *means]))
-    transforms = {
-        p: [row for c in cells if c["prior"] == p for row in c["contact_transform"]] for p in priors
-    }
-    with SummaryWriter(folder / "tensorboard") as writer:
-        for prior, rows in transforms.items():
-            figure = calibration(_array(rows), CHANNELS, "rows in contact")
-            save_figure(figure, folder / "figures", f"calibration-{prior}", writer)
-        labels = {"x_mm": "error of x [mm]", "z_mm": "error of z [mm]", "F_z_N": "error of F_z [N]"}
-        figure = error_bars(table, labels, group="prior", targets=TARGETS)
-        save_figure(figure, folder / "figures", "errors", writer)
-        for row in means:
-            for key, value in row.items():
-                if isinstance(value, float):
-                    label = f"{key}/{row['prior']}/{row['object'].removeprefix('MEAN ')}"
-                    writer.add_scalar(label, value)
-        writer.add_text("table", "```\n" + format_table([*table, *means]) + "\n```")
-    write_results(folder, [*table, *means], seeds=config.seeds, targets=TARGETS)
-    print(f"results in {folder}")
+    with opened_run(config, "python -m eval.unseen", ("out",)) as folder:
+        path = folder / "cells.jsonl"
+        cells = read_lines(path)
+        plan = [(n, p, s) for s in config.seeds for n in names for p in priors]
+        done = {(c["object"], c["prior"], c["seed"]) for c in cells}
+        with append_lines(path) as lines:
+            for name, prior, seed in tqdm(plan, unit="cell", initial=0):
+                if (name, prior, seed) in done:
+                    continue
+                shape = load_prior(priors[prior])
+                cell = _cell(config, name, outlines[name].vertices, prior, shape, seed)
+                write_line(lines, cell)
+                cells.append(cell)
+        columns = [key for key in cells[0] if key not in ("contact_transform", "theta_score")]
+        table = [{key: cell[key] for key in columns} for cell in cells]
+        means = _means(table, list(priors))
+        print(format_table([*table, *means]))
+        transforms = {
+            p: [row for c in cells if c["prior"] == p for row in c["contact_transform"]]
+            for p in priors
+        }
+        with SummaryWriter(folder / "tensorboard") as writer:
+            for prior, rows in transforms.items():
+                figure = calibration(_array(rows), CHANNELS, "rows in contact")
+                save_figure(figure, folder / "figures", f"calibration-{prior}", writer)
+            labels = {
+                "x_mm": "error of x [mm]",
+                "z_mm": "error of z [mm]",
+                "F_z_N": "error of F_z [N]",
+            }
+            figure = error_bars(table, labels, group="prior", targets=TARGETS)
+            save_figure(figure, folder / "figures", "errors", writer)
+            for row in means:
+                for key, value in row.items():
+                    if isinstance(value, float):
+                        label = f"{key}/{row['prior']}/{row['object'].removeprefix('MEAN ')}"
+                        writer.add_scalar(label, value)
+            writer.add_text("table", "```\n" + format_table([*table, *means]) + "\n```")
+        write_results(folder, [*table, *means], seeds=config.seeds, targets=TARGETS)
+        print(f"results in {folder}")
 
 
 def _cell(

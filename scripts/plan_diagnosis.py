@@ -8,6 +8,7 @@ python scripts/plan_diagnosis.py --after runs/mug/diagnosis.csv
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -81,13 +82,16 @@ def plan_diagnosis(config: Planning) -> None:
     """Simulate or plan the motion that a diagnosis needs, or say what episodes lack for one."""
     import torch
 
+    from tpcd.ownership import owned
+
     torch.set_num_threads(1)
-    if config.object is not None:
-        _simulate(config, config.object)
-    elif config.start:
-        _plan(config)
-    else:
-        _complete(config)
+    with nullcontext() if config.out is None else owned(config.out, "scripts/plan_diagnosis.py"):
+        if config.object is not None:
+            _simulate(config, config.object)
+        elif config.start:
+            _plan(config)
+        else:
+            _complete(config)
 
 
 def _simulate(config: Planning, name: str) -> None:

@@ -7,7 +7,8 @@ python scripts/simulate.py --outline 006_mustard_bottle --policy test --episodes
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -28,6 +29,15 @@ LIMITS = {
     "noise_angle": (0.5, "rad", "degrees"),
 }
 """Sizes beyond which a value was meant in another unit, as in episodes."""
+PHYSICAL = ("start", "stiffness", "scale", "mount_x", "mount_z", "mount_phi", "friction",
+            "floor_height", "wall_position", "effects")  # fmt: skip
+NOISE = {
+    "noise_position": ("x", "z"),
+    "noise_angle": ("phi",),
+    "noise_force": ("F_x", "F_z"),
+    "noise_torque": ("tau",),
+}
+"""What can make a row of the episode one that no recording has; noise of its columns only."""
 FILE_ENDINGS = (".csv", ".parquet", ".yaml", ".truth.csv", ".truth.yaml")
 """Of the files that an episode here can have."""
 
@@ -117,6 +127,16 @@ class Simulation:
                 ) from error
         return found
 
+    def blamed(self, problem: str) -> str:
+        """What the episode would have wrong, with the options in front that may have done it."""
+        columns = set(re.findall(r"\w+", problem.partition(":")[0]))
+        noise = [name for name, own in NOISE.items() if columns.intersection(own)]
+        usual = {field.name: field.default for field in fields(self)}
+        given = [name for name in (*noise, *PHYSICAL) if getattr(self, name) != usual[name]]
+        options = " and ".join(f"--{name}" for name in given or ("policy", "seed"))
+        verb = "makes" if len(given) == 1 else "make"
+        return f"{options} {verb} an episode that cannot be, {problem}; choose other values"
+
     def _value(self, name: str) -> float | None:
         """A field, or the entry `start x`, `start z` or `start phi` of the start pose."""
         if not name.startswith("start "):
@@ -128,11 +148,14 @@ class Simulation:
 def simulate(config: Simulation) -> None:
     """Simulate episodes of an object in the hand that touches a floor and a wall."""
     import sys
+    from contextlib import ExitStack
 
     import torch
 
     from tpcd.data.files import write_together
+    from tpcd.errors import EpisodeError
     from tpcd.files import to_plain
+    from tpcd.ownership import owned
     from tpcd.parameters import SCENE_NAMES
     from tpcd.random import stream
     from tpcd.shape.named import find_outline
@@ -144,40 +167,48 @@ def simulate(config: Simulation) -> None:
     torch.set_num_threads(1)
     name = config.name or config.policy
     names = [name] if config.episodes == 1 else [f"{name}_{i}" for i in range(config.episodes)]
-    for file in [f"{stem}{ending}" for stem in names for ending in FILE_ENDINGS]:
-        check_target(config.out / file, config.overwrite)
-    outline = find_outline(config.outline, config.unit)
-    given = {name: getattr(config, name) for name in SCENE_NAMES}
-    scene = draw_scene(
-        outline.name,
-        outline.vertices,
-        stream(config.seed, SCENE_STREAM),
-        fixed={name: value for name, value in given.items() if value is not None},
-        stiffness=config.stiffness,
-        start_pose=config.start or None,
-    )
-    position, angle = config.noise_position, config.noise_angle
-    force, torque = config.noise_force, config.noise_torque
-    sensor_std = torch.tensor(
-        [position, position, angle, force, force, torque], dtype=torch.float64
-    )
-    truth = make_truth(scene, config.truth, config.hidden, config.steps)
-    notes = f"simulated, truth {config.truth}, motion {config.policy}, seed {config.seed}"
-    made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
-    contents, lines = {}, []
-    for episode, stem in enumerate(config.out / name for name in names):
-        generator = stream(config.seed, EPISODE_STREAM, episode, *config.policy.encode())
-        motion = make_motion(config.policy, scene, config.steps, generator)
-        recording = record(truth, scene, motion, config.steps, generator, sensor_std, notes=notes)
-        contents.update(recording_contents(recording, scene, stem, config.format, made_by))
-        reach = [scene.clearances(pose) for pose in recording.true.poses[1:]]
-        lines.append(
-            f"{stem}.{config.format}: {config.steps} steps,"
-            f" {sum(floor < TOUCHING for floor, _ in reach)} touch the floor,"
-            f" {sum(wall < TOUCHING for _, wall in reach)} the wall,"
-            f" {recording.settled.count(False)} did not settle"
+    with ExitStack() as held:
+        for stem in names:
+            held.enter_context(owned(config.out / stem, "scripts/simulate.py"))
+        for file in [f"{stem}{ending}" for stem in names for ending in FILE_ENDINGS]:
+            check_target(config.out / file, config.overwrite)
+        outline = find_outline(config.outline, config.unit)
+        given = {name: getattr(config, name) for name in SCENE_NAMES}
+        scene = draw_scene(
+            outline.name,
+            outline.vertices,
+            stream(config.seed, SCENE_STREAM),
+            fixed={name: value for name, value in given.items() if value is not None},
+            stiffness=config.stiffness,
+            start_pose=config.start or None,
         )
-    write_together(contents, config.overwrite)
+        position, angle = config.noise_position, config.noise_angle
+        force, torque = config.noise_force, config.noise_torque
+        sensor_std = torch.tensor(
+            [position, position, angle, force, force, torque], dtype=torch.float64
+        )
+        truth = make_truth(scene, config.truth, config.hidden, config.steps)
+        notes = f"simulated, truth {config.truth}, motion {config.policy}, seed {config.seed}"
+        made_by = {"command": "scripts/simulate.py", "config": to_plain(config), **versions()}
+        contents, lines = {}, []
+        for episode, stem in enumerate(config.out / name for name in names):
+            generator = stream(config.seed, EPISODE_STREAM, episode, *config.policy.encode())
+            motion = make_motion(config.policy, scene, config.steps, generator)
+            recording = record(
+                truth, scene, motion, config.steps, generator, sensor_std, notes=notes
+            )
+            try:
+                contents.update(recording_contents(recording, scene, stem, config.format, made_by))
+            except EpisodeError as error:
+                raise ValueError(config.blamed(error.problem)) from error
+            reach = [scene.clearances(pose) for pose in recording.true.poses[1:]]
+            lines.append(
+                f"{stem}.{config.format}: {config.steps} steps,"
+                f" {sum(floor < TOUCHING for floor, _ in reach)} touch the floor,"
+                f" {sum(wall < TOUCHING for _, wall in reach)} the wall,"
+                f" {recording.settled.count(False)} did not settle"
+            )
+        write_together(contents, config.overwrite)
     if Path(config.outline).suffix and outline.notes:
         print(f"note: {config.outline}: {outline.notes}", file=sys.stderr)
     theta = " · ".join(f"{name} {value:.4g}" for name, value in scene.theta.items())

@@ -37,6 +37,7 @@ from typing import Any, NoReturn, TypeVar
 
 from tpcd import __version__
 from tpcd.cli_messages import check_config_files, parsing_problem, system_problem
+from tpcd.console import forgiving_console
 from tpcd.errors import TpcdError
 
 if typing.TYPE_CHECKING:
@@ -66,10 +67,30 @@ def run(
     to how the command was called, `description` to the docstring of `main`. A `TpcdError`,
     `ValueError` or `OSError` from `main` becomes one line on stderr and a non-zero exit
     code, with the traceback before it under `--debug`; Ctrl-C gives 130. Anything else is
-    a mistake in the program and keeps its traceback.
+    a mistake in the program and keeps its traceback. What the console cannot show or take changes
+    neither the work nor, but for a full disk behind it, the exit code (`console`).
     """
     prog = prog or _program_name()
     arguments = list(sys.argv[1:] if argv is None else argv)
+    with forgiving_console() as console:
+        code = _code_of(main, config, arguments, positional, prog, description)
+        console.flush()
+        if console.lost is not None:
+            line = system_problem(console.lost)
+            print(f"{prog}: standard output: {line}; not all could be printed", file=sys.stderr)
+            code = code or EXIT_BAD_INPUT
+    sys.exit(code)
+
+
+def _code_of(
+    main: Callable[[Config], int | None],
+    config: type[Config],
+    arguments: list[str],
+    positional: Sequence[str],
+    prog: str,
+    description: str | None,
+) -> int:
+    """The exit code of a command; what went wrong is told."""
     debug = "--debug" in arguments
     try:
         settings = parse(
@@ -79,10 +100,10 @@ def run(
             prog=prog,
             description=description or inspect.getdoc(main),
         )
-        code = main(settings) or 0
+        return main(settings) or 0
     except KeyboardInterrupt as stop:
         print(f"{prog}: interrupted" + (f"; {stop}" if str(stop) else ""), file=sys.stderr)
-        code = EXIT_INTERRUPTED
+        return EXIT_INTERRUPTED
     except (TpcdError, ValueError, OSError) as error:
         if debug:
             traceback.print_exc()
@@ -91,8 +112,7 @@ def run(
         else:
             line = " ".join(str(error).split()) or type(error).__name__
         print(f"{prog}: error: {line}", file=sys.stderr)
-        code = error.exit_code if isinstance(error, TpcdError) else EXIT_BAD_INPUT
-    sys.exit(code)
+        return error.exit_code if isinstance(error, TpcdError) else EXIT_BAD_INPUT
 
 
 def parse(

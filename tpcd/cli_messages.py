@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -21,6 +22,9 @@ REMEDIES = {
     errno.EROFS: "choose a place where you may write",
     errno.ENOENT: "check the path",
     errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space of your quota",
+    errno.EFBIG: "raise the limit on the size of files",
+    errno.EIO: "check the disk",
     errno.ENOTDIR: "a file stands where a folder is needed",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
@@ -47,10 +51,11 @@ def parsing_problem(message: str, names: Iterable[str]) -> str:
 
 def system_problem(error: OSError) -> str:
     """An error of the operating system with the file in front and what to do behind."""
-    if error.filename is None or error.strerror is None:
+    if error.strerror is None:
         return " ".join(str(error).split()) or type(error).__name__
-    remedy = REMEDIES.get(error.errno or 0)
-    return f"{error.filename}: {error.strerror}" + (f"; {remedy}" if remedy else "")
+    remedy, file = REMEDIES.get(error.errno or 0), error.filename
+    front = "" if file is None else f"{os.fsdecode(file) if isinstance(file, bytes) else file}: "
+    return f"{front}{error.strerror}" + (f"; {remedy}" if remedy else "")
 
 
 def check_config_files(paths: Sequence[str]) -> None:

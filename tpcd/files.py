@@ -1,8 +1,8 @@
 """Text and JSON files, written in one move, and plain values of what goes into them.
 
-Files are written under a temporary name and moved into place, so that none is ever half there.
-JSON has no NaN: such a value is stored as null and its place listed under `non_finite`. Nothing
-heavy is imported here.
+Files are written under a temporary name and moved into place, so that none is ever half there, and
+a disk that is full is told with the file's name. JSON has no NaN: such a value is stored as null
+and its place listed under `non_finite`. Nothing heavy is imported here.
 """
 
 from __future__ import annotations
@@ -12,22 +12,54 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tpcd.errors import FileError
 
 
-def write_text(path: Path, text: str) -> Path:
-    """Write a file in UTF-8 in one move; its folder is made if needed."""
+@contextmanager
+def named(path: str | Path) -> Iterator[None]:
+    """Give the file's name to an error of the system that has none, as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def staged(path: Path) -> Iterator[Path]:
+    """A temporary file to write in place of `path`, which it replaces once the body is done.
+
+    The folder is made if needed. Errors of the system name `path`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        temporary.write_text(text, encoding="utf-8")
+        with named(path):
+            yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename == str(temporary):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a file in UTF-8 in one move; its folder is made if needed."""
+    return write_bytes(path, text.encode("utf-8", "surrogateescape"))
+
+
+def write_bytes(path: Path, content: bytes) -> Path:
+    """Write a file in one move; its folder is made if needed."""
+    with staged(path) as temporary:
+        temporary.write_bytes(content)
     return path
 
 

@@ -3,43 +3,40 @@
 A run folder holds `config.yaml` (the resolved configuration, readable by `--config`),
 `versions.json` (command, date, git revision, packages, hardware) and, once the work is
 done, `results.json` (the printed table with all of that). `run_folder` leaves a folder only
-where the work in it is done. Nothing heavy is imported here.
+where the work in it is done, or can go on. While work goes on in a folder, no other process gets
+it (`ownership`). Nothing heavy is imported here.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from tpcd.cli_messages import REMEDIES
 from tpcd.errors import RunError
 from tpcd.files import read_json, to_plain, write_json, write_text
+from tpcd.ownership import check_none_within, is_lock, owned
 from tpcd.targets import ELSEWHERE, check_place
 from tpcd.versions import versions
 
 CONFIG_FILE = "config.yaml"
 VERSIONS_FILE = "versions.json"
 RESULTS_FILE = "results.json"
-
-
-def open_run(
-    path: str | Path, command: str, config: Mapping[str, Any] | Any, overwrite: bool = False
-) -> Path:
-    """Make a run folder that says what is about to run, and return it; see also `run_folder`.
-
-    `command` names the program (`scripts/estimate.py`), `config` is its dataclass or a
-    mapping. Raises `RunError` when the folder already holds something; with `overwrite`
-    an earlier run there is removed, but never a folder that is not a run, or that holds a file
-    which the configuration names.
-    """
-    folder = Path(path)
-    if _holds_run(folder, overwrite):
-        _spare_inputs(folder, config)
-        shutil.rmtree(folder)
-    return _started(folder, command, config)
+STORAGE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EIO,
+)
+"""Errors of a disk that takes no more; what raises them often does not say for which file."""
 
 
 @contextmanager
@@ -50,65 +47,95 @@ def run_folder(
     overwrite: bool = False,
     resumable: str | None = None,
 ) -> Iterator[Path]:
-    """A run folder as `open_run` makes it that stays only if the work in it is done.
+    """A run folder that says what is run, belongs to this process while it runs, and stays only if
+    the work in it is done.
 
+    `command` names the program (`scripts/estimate.py`), `config` is its dataclass or a mapping.
     Where the body raises or is interrupted, what it wrote is removed and an earlier run
     that it was to replace is put back. `resumable` names the file or folder with which a stopped
-    run can go on (`continue_run`): once it is there, the run stays.
+    run can go on (`resumed_run`): once it is there, the run stays.
+
+    Raises `RunError` when the folder belongs to another process or already holds something; with
+    `overwrite` an earlier run there is replaced, but never a folder that is not a run, or that
+    holds a file which the configuration names.
     """
-    folder = Path(path).absolute()
-    aside = folder.with_name(f".{folder.name}.{os.getpid()}.earlier")
-    replacing = _holds_run(Path(path), overwrite, resumable)
-    if replacing:
-        _spare_inputs(Path(path), config)
-    was_there = folder.is_dir() and not replacing
-    new_parents = [parent for parent in folder.parents if not parent.exists()]
-    if replacing:
-        os.replace(folder, aside)
-    try:
-        yield _started(Path(path), command, config)
-    except BaseException as error:
-        if resumable and (folder / resumable).exists():
-            shutil.rmtree(aside, ignore_errors=True)
-            if isinstance(error, KeyboardInterrupt):
-                raise _interrupted(path, error) from error
-            raise
-        shutil.rmtree(folder, ignore_errors=True)
+    folder = Path(path).resolve()
+    _check_place(Path(path))
+    with owned(path, command):
+        aside = _aside(folder, resumable)
+        replacing = _holds_run(Path(path), overwrite, resumable)
+        was_there = folder.is_dir() and not replacing
         if replacing:
-            os.replace(aside, folder)
-        elif was_there:
-            folder.mkdir()
-        for parent in new_parents:
-            with suppress(OSError):  # something else may have come into it
-                parent.rmdir()
-        raise
-    shutil.rmtree(aside, ignore_errors=True)
+            _spare_inputs(Path(path), config)
+            check_none_within(path)
+            _move_aside(folder, aside)
+        try:
+            _start(folder, command, config)
+            yield Path(path)
+        except BaseException as error:
+            if resumable and (folder / resumable).exists():
+                shutil.rmtree(aside, ignore_errors=True)
+                _raise_told(error, path, f"{path} goes on with --resume")
+            shutil.rmtree(folder, ignore_errors=True)
+            if replacing:
+                os.replace(aside, folder)
+            elif was_there:
+                folder.mkdir(exist_ok=True)
+            kept = "the earlier run is as it was" if replacing else "nothing of the run is kept"
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            _raise_told(error, path, kept)
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextmanager
 def resumed_run(
     path: str | Path, config: Mapping[str, Any] | Any, free: Sequence[str] = ()
 ) -> Iterator[Path]:
-    """The folder of `continue_run`; where the body is interrupted, what is told says how the run
-    goes on."""
-    folder = continue_run(path, config, free)
-    try:
-        yield folder
-    except KeyboardInterrupt as error:
-        raise _interrupted(path, error) from error
+    """The folder of a run that was stopped, to go on in it; it belongs to this process meanwhile.
+
+    Raises `RunError` when it belongs to another process, or holds no run or one of another
+    configuration; entries named in `free` may differ, `resume` and `overwrite` always, and the
+    run's `config.yaml` takes their new values. A file may be named in another way, as from another
+    folder.
+    """
+    folder = Path(path)
+    if not (folder / CONFIG_FILE).is_file():
+        raise RunError(folder, "holds no run to go on with", "leave out --resume")
+    with owned(path, _command(folder)):
+        _continue(folder, config, free)
+        shutil.rmtree(_earlier(folder.resolve()), ignore_errors=True)
+        try:
+            yield folder
+        except BaseException as error:
+            _raise_told(error, path, f"{path} goes on with --resume")
 
 
-def _interrupted(path: str | Path, error: KeyboardInterrupt) -> KeyboardInterrupt:
-    said = f"{error}; " if str(error) else ""
-    return KeyboardInterrupt(f"{said}{path} goes on with --resume")
+def _raise_told(error: BaseException, path: str | Path, what: str) -> NoReturn:
+    """Raise what stopped a run, with what is left of it where that is in question."""
+    if isinstance(error, KeyboardInterrupt):
+        said = f"{error}; " if str(error) else ""
+        raise KeyboardInterrupt(f"{said}{what}") from error
+    if not isinstance(error, OSError) or error.errno not in STORAGE:
+        raise error
+    place, cause = error.filename, error.__context__
+    # What closes the files of a full disk fails once more, and without a name.
+    while place is None and cause is not None:
+        place, cause = getattr(cause, "filename", None), cause.__context__
+    remedy = REMEDIES.get(error.errno)
+    hint = f"{remedy}; {what}" if remedy else what
+    raise RunError(place or path, error.strerror or str(error), hint) from error
+
+
+def _check_place(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise RunError(folder, "is a file", "name a folder for the results")
+    check_place(folder)
 
 
 def _holds_run(folder: Path, overwrite: bool, resumable: str | None = None) -> bool:
     """Whether an earlier run is to be replaced; `RunError` where nothing may be put there."""
-    if folder.exists() and not folder.is_dir():
-        raise RunError(folder, "is a file", "name a folder for the results")
-    if not folder.is_dir() or not any(folder.iterdir()):
-        check_place(folder)
+    if not folder.is_dir() or all(is_lock(entry) for entry in folder.iterdir()):
         return False
     if not overwrite:
         stopped = bool(resumable) and (folder / str(resumable)).exists()
@@ -120,6 +147,33 @@ def _holds_run(folder: Path, overwrite: bool, resumable: str | None = None) -> b
             folder, f"is not a run (no {VERSIONS_FILE}), not overwritten", "name a new folder"
         )
     return True
+
+
+def _earlier(folder: Path) -> Path:
+    """Where a run waits until the one that replaces it is done."""
+    return folder.with_name(f".{folder.name}.earlier")
+
+
+def _aside(folder: Path, resumable: str | None) -> Path:
+    """The place for an earlier run, empty. One is there where a process was killed while it
+    replaced it: it comes back, unless what replaces it is done or can go on."""
+    aside = _earlier(folder)
+    if aside.is_dir():
+        names = (RESULTS_FILE, *([resumable] if resumable else []))
+        if any((folder / name).exists() for name in names):
+            shutil.rmtree(aside)
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+            os.replace(aside, folder)
+    return aside
+
+
+def _move_aside(folder: Path, aside: Path) -> None:
+    try:
+        os.replace(folder, aside)
+    except OSError as error:
+        fault = f"cannot be replaced ({error.strerror})"
+        raise RunError(folder, fault, "name a new folder") from error
 
 
 def _spare_inputs(folder: Path, config: Mapping[str, Any] | Any) -> None:
@@ -143,7 +197,7 @@ def _episode_there(place: Path) -> bool:
     return any(place.with_name(place.name + suffix).exists() for suffix in (".csv", ".parquet"))
 
 
-def _started(folder: Path, command: str, config: Mapping[str, Any] | Any) -> Path:
+def _start(folder: Path, command: str, config: Mapping[str, Any] | Any) -> None:
     """Make the folder and write what is about to run."""
     import yaml
 
@@ -154,33 +208,43 @@ def _started(folder: Path, command: str, config: Mapping[str, Any] | Any) -> Pat
     body = yaml.safe_dump(_kept(config), sort_keys=False, allow_unicode=True)
     write_text(folder / CONFIG_FILE, f"# {command}\n{body}")
     write_json(folder / VERSIONS_FILE, {"command": command, **versions()})
-    return folder
 
 
-def continue_run(
-    path: str | Path, config: Mapping[str, Any] | Any, free: Sequence[str] = ()
-) -> Path:
-    """Return the folder of a run that was stopped, to go on in it.
-
-    Raises `RunError` when the folder holds no run, or one of another configuration; entries
-    named in `free` may differ, `resume` and `overwrite` always, and the run's `config.yaml` takes
-    their new values.
-    """
+def _continue(folder: Path, config: Mapping[str, Any] | Any, free: Sequence[str]) -> None:
+    """Refuse to go on with another configuration, and keep the new values."""
     import yaml
 
-    folder = Path(path)
-    if not (folder / CONFIG_FILE).is_file():
-        raise RunError(folder, "holds no run to go on with", "leave out --resume")
     before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
     before, now = _kept(before), _kept(config)
-    differing = [key for key in now if key not in free and now[key] != before.get(key)]
+    recorded = read_json(folder / VERSIONS_FILE) if (folder / VERSIONS_FILE).is_file() else {}
+    began_in = Path(recorded.get("folder", ""))
+    changed = [key for key in now if now[key] != before.get(key)]
+    differing = [key for key in changed if not _same(before.get(key), now[key], began_in)]
+    differing = [key for key in differing if key not in free]
     if differing:
         raise RunError(
             folder, f"holds a run whose {_listed(differing)} not the same", "name a new folder"
         )
-    if any(now[key] != before.get(key) for key in now):
+    if changed:
         write_text(folder / CONFIG_FILE, yaml.safe_dump(now, sort_keys=False))
-    return folder
+        write_json(folder / VERSIONS_FILE, recorded | {"folder": os.getcwd()})
+
+
+def _same(before: Any, now: Any, began_in: Path) -> bool:
+    """Whether two entries are equal, or name the same file: one from where the run began, one from
+    here."""
+    if isinstance(before, list) and isinstance(now, list):
+        pairs = zip(before, now, strict=False)
+        return len(before) == len(now) and all(_same(*pair, began_in) for pair in pairs)
+    if isinstance(before, str) and isinstance(now, str) and Path(now).exists():
+        return (began_in / before).resolve() == Path(now).resolve()
+    return before == now
+
+
+def _command(folder: Path) -> str:
+    """What a run was begun by; it goes on with the same."""
+    recorded = folder / VERSIONS_FILE
+    return read_json(recorded)["command"] if recorded.is_file() else "another process"
 
 
 def _kept(config: Mapping[str, Any] | Any) -> dict[str, Any]:
@@ -204,13 +268,13 @@ def write_results(
     """Write `results.json` into an opened run: table, configuration, versions, seeds.
 
     `table` is what was printed, or the numbers behind it, one mapping for each row; `extra` adds
-    further entries beside it. Raises `RunError` when the folder was not made by `open_run`.
+    further entries beside it. Raises `RunError` when the folder was not made by `run_folder`.
     """
     import yaml
 
     folder = Path(folder)
     if not (folder / CONFIG_FILE).is_file() or not (folder / VERSIONS_FILE).is_file():
-        raise RunError(folder, "is not an opened run", "make it with open_run first")
+        raise RunError(folder, "is not an opened run", "make it with run_folder first")
     recorded = read_json(folder / VERSIONS_FILE)
     content = {
         "command": recorded.pop("command"),

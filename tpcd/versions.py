@@ -1,4 +1,5 @@
-"""What the numbers of a run depend on besides its configuration: code and machine."""
+"""What the numbers of a run depend on besides its configuration: code and machine, and the folder
+that its relative paths start from."""
 
 from __future__ import annotations
 
@@ -34,6 +35,7 @@ def versions() -> dict[str, Any]:
     """What the numbers of a run depend on besides its configuration: code and machine."""
     return {
         "date_utc": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "folder": os.getcwd(),
         "tpcd": __version__,
         "git": _git_state(),
         "python": platform.python_version(),

@@ -25,6 +25,7 @@ from typing import Any
 
 from eval.blind.suites import SUITES, Case, plan
 from eval.lines import append_lines, write_line
+from eval.opened import shared_run
 from tpcd.cli import check_numbers, run
 
 COMMAND = "python -m eval.blind"
@@ -66,23 +67,22 @@ class Blind:
 
 def run_blind(config: Blind) -> None:
     """Name hidden effects without the key, then open it and score."""
+    import torch
+
+    torch.set_num_threads(1)
+    # More cases may be asked of an earlier run; what is in a case must stay the same.
+    free = ("out", "workers", "suites", "runs", "quick")
+    with shared_run(config, COMMAND, free):
+        _run_shared(config)
+
+
+def _run_shared(config: Blind) -> None:
+    """The work of this process and, for the first one, the score of all."""
     from datetime import timedelta
 
-    import torch
     from lightning.fabric import Fabric
     from lightning.fabric.strategies.ddp import DDPStrategy
 
-    from tpcd.results import continue_run, open_run
-
-    torch.set_num_threads(1)
-    # Before there are other processes, so that a folder in use is one line and not a crash.
-    if int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))) == 0:
-        if config.resume:
-            # More cases may be asked of an earlier run; what is in a case must stay the same.
-            cases = ("suites", "runs", "quick")
-            continue_run(config.out, config, ("out", "workers", *cases))
-        else:
-            open_run(config.out, COMMAND, config, config.overwrite)
     # Workers end at different times; the first waits for the last.
     parallel: Any = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
     if "LT_CLI_USED" in os.environ:  # `fabric run` has made the processes and says how many

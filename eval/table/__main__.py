@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.lines import append_lines, read_lines, write_line
+from eval.opened import shared_run
 from eval.unseen import UNSEEN
 from tpcd.cli import check_numbers, run
 from tpcd.errors import FileError
@@ -106,25 +107,25 @@ class Table:
 
 def make_table(config: Table) -> None:
     """Run the cells that are missing, in as many processes as asked, and print the table."""
-    from datetime import timedelta
-
     import torch
-    from lightning.fabric import Fabric
-    from lightning.fabric.strategies.ddp import DDPStrategy
 
     from eval.objects import main_outlines
-    from tpcd.results import continue_run, open_run
 
     torch.set_num_threads(1)
     main_outlines(config.objects)
-    # Before there are other processes, so that a folder in use is one line and not a crash.
-    if int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))) == 0:
-        if config.resume:
-            # More cells may be asked of an earlier run; what is in a cell must stay the same.
-            cells = ("truths", "objects", "rows", "seeds")
-            continue_run(config.out, config, ("out", "workers", *cells))
-        else:
-            open_run(config.out, "python -m eval.table", config, config.overwrite)
+    # More cells may be asked of an earlier run; what is in a cell must stay the same.
+    free = ("out", "workers", "truths", "objects", "rows", "seeds")
+    with shared_run(config, "python -m eval.table", free):
+        _run_shared(config)
+
+
+def _run_shared(config: Table) -> None:
+    """The cells of this process and, for the first one, the table of all."""
+    from datetime import timedelta
+
+    from lightning.fabric import Fabric
+    from lightning.fabric.strategies.ddp import DDPStrategy
+
     # Workers end at different times; the first waits for the last.
     parallel: Any = DDPStrategy(process_group_backend="gloo", timeout=timedelta(days=7))
     if "LT_CLI_USED" in os.environ:  # `fabric run` has made the processes and says how many

@@ -7,7 +7,6 @@ and goes on gives the same numbers as one that was not.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from tpcd.data.episode import Episode
 from tpcd.errors import RunError
+from tpcd.files import write_bytes
 from tpcd.shape.checkpoint import prior_hash
 
 STATE_FILE = "state.safetensors"
@@ -43,7 +43,6 @@ class EstimatorState:
 def save_state(state: EstimatorState, folder: Path, episode: Episode, prior: str | Path) -> None:
     """Write the state in one move, with fingerprints of the episode that it belongs to and of the
     shape prior (its folder or name)."""
-    target = folder / STATE_FILE
     content = {name: value.contiguous() for name, value in state.tensors.items()}
     content["generator"] = state.generator
     card = {
@@ -52,9 +51,7 @@ def save_state(state: EstimatorState, folder: Path, episode: Episode, prior: str
         "episode": fingerprint(episode),
         "prior": prior_hash(prior),
     }
-    staged = target.with_suffix(".staged")
-    staged.write_bytes(save_tensors(content, card))
-    os.replace(staged, target)
+    write_bytes(folder / STATE_FILE, save_tensors(content, card))
 
 
 def load_state(

@@ -7,7 +7,6 @@ nothing under another prior.
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.effects.model import effects_from_plain, effects_to_plain
 from tpcd.errors import RunError
-from tpcd.files import read_json, write_json
+from tpcd.files import read_json, write_bytes, write_json
 from tpcd.shape.checkpoint import load_prior, prior_hash
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
@@ -36,10 +35,7 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {name: getattr(belief, name).contiguous() for name in _TENSORS}
     tensors |= {"low": belief.prior.low, "high": belief.prior.high}
-    target = folder / "belief.safetensors"
-    staged = target.with_suffix(".staged")
-    staged.write_bytes(save_tensors(tensors))
-    os.replace(staged, target)
+    write_bytes(folder / "belief.safetensors", save_tensors(tensors))
     return write_json(
         folder / "belief.json",
         {

@@ -25,7 +25,7 @@ from tpcd.effects.model import Model, write_model
 from tpcd.effects.shape_change import UNCHANGED, ShapeChange
 from tpcd.errors import RunError
 from tpcd.figures.sinks import save_figure
-from tpcd.files import read_json, write_json
+from tpcd.files import read_json, write_json, write_text
 from tpcd.results import RESULTS_FILE, resumed_run, run_folder
 from tpcd.versions import versions
 
@@ -89,7 +89,7 @@ def write_diagnosis(
         path = save_figure(figure, folder / "figures", name, writer, heading="diagnosis")
         images[name] = (caption, base64.b64encode(path.read_bytes()).decode("ascii"))
     page = folder / "report.html"
-    page.write_text(render_page(diagnosis, images, [e.path for e in episodes]), encoding="utf-8")
+    write_text(page, render_page(diagnosis, images, [e.path for e in episodes]))
     writer.add_text("verdict", f"**{diagnosis.verdict.replace('_', ' ')}**: {diagnosis.sentence}")
     return page
 

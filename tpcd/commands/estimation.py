@@ -28,7 +28,7 @@ from tpcd.commands.summary import prior_summary, summarise
 from tpcd.commands.unexplained import unexplained_rows, unexplained_warning
 from tpcd.data.episode import Episode
 from tpcd.exploration import Closing
-from tpcd.files import write_json, write_text
+from tpcd.files import named, write_json, write_text
 from tpcd.simulator.native import available
 
 STEPS_FILE, SUMMARY_FILE = "steps.jsonl", "summary.json"
@@ -119,8 +119,9 @@ class EstimationRun:
         self.belief, self.state = step.belief, step.state
         row = {**step_row(step, learnt), **(further or {})}
         self.history.append(row)
-        self._lines.write(json.dumps(row) + "\n")
-        self._lines.flush()
+        with named(self.folder / STEPS_FILE):
+            self._lines.write(json.dumps(row) + "\n")
+            self._lines.flush()
         save_belief(step.belief, self.folder, self._prior_name)
         save_state(step.state, self.folder, episode, self._prior_name)
         _log_scalars(self.writer, row, step)

@@ -28,6 +28,7 @@ from tpcd.data.header import ESTIMATE_NOISE, Header, encode_header, parse_header
 from tpcd.data.measured import NoCommandsError
 from tpcd.data.table import Table, encode_table, read_table
 from tpcd.errors import EpisodeError
+from tpcd.files import named
 
 TABLE_SUFFIXES = (".csv", ".parquet")
 
@@ -147,7 +148,7 @@ def write_together(contents: dict[Path, bytes | None], overwrite: bool = True) -
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
             staged[path] = Path(name)
-            with os.fdopen(handle, "wb") as file:
+            with named(path), os.fdopen(handle, "wb") as file:
                 file.write(content)
             os.chmod(name, 0o644)
         for path in contents:

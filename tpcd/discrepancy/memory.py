@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -20,6 +19,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from tpcd.errors import RunError
+from tpcd.files import write_bytes
 
 T = TypeVar("T")
 
@@ -51,14 +51,12 @@ class Memory:
         if path.is_file():
             return _read(path, kind)
         found = work()
-        self.folder.mkdir(parents=True, exist_ok=True)
         own = {field.name: getattr(found, field.name) for field in fields(found)}  # type: ignore[arg-type]
         tensors = {k: v.contiguous() for k, v in own.items() if isinstance(v, Tensor)}
         plain = {k: v for k, v in own.items() if not isinstance(v, Tensor)}
-        staged = path.with_suffix(".staged")
         # A file needs one tensor at least.
-        staged.write_bytes(save_tensors(tensors or {"": torch.zeros(0)}, {"": json.dumps(plain)}))
-        os.replace(staged, path)
+        tensors = tensors or {"": torch.zeros(0)}
+        write_bytes(path, save_tensors(tensors, {"": json.dumps(plain)}))
         return found
 
 

@@ -39,6 +39,7 @@ from tpcd.effects.own import file_sha256, load_effects
 from tpcd.effects.protocol import Effect, EffectParameter, effect_to_plain
 from tpcd.effects.shape_change import UNCHANGED, ShapeChange, shape_from_plain
 from tpcd.errors import ModelError
+from tpcd.files import write_text
 from tpcd.simulator.record import StepSettings
 
 Found = Mapping[str, Mapping[str, tuple[float, float]]]
@@ -115,8 +116,7 @@ def write_model(model: Model, path: str | Path, notes: str | None = None) -> Pat
         content["shape"] = model.shape.to_plain()
     if notes:
         content["notes"] = notes
-    path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    return path
+    return write_text(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
 def effects_to_plain(effects: Sequence[Effect], fingerprints: bool = False) -> list[dict[str, Any]]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from tpcd.files import staged
 
 
 @runtime_checkable
@@ -38,13 +39,8 @@ def save_figure(
     if not name or Path(name).name != name:
         raise ValueError(f"name of a figure is {name!r}, expected a file name without a folder")
     path = Path(folder) / f"{name}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with staged(path) as temporary:
         figure.savefig(temporary, format="png", dpi="figure", facecolor="white")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     if writer is not None:
         canvas = FigureCanvasAgg(figure)
         canvas.draw()

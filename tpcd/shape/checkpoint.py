@@ -24,6 +24,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from tpcd.errors import CheckpointError
+from tpcd.files import named
 from tpcd.shape.deepsdf import Architecture, DeepSDFNetwork, DeepSDFShape
 from tpcd.shape.density import LatentDensity, MaskDensity, MixtureDensity
 from tpcd.shape.protocol import Misfit
@@ -107,8 +108,10 @@ def save_prior(
     folder.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
     try:
-        (staging / WEIGHTS).write_bytes(weights)
-        (staging / CARD).write_text(json.dumps(full_card, indent=1) + "\n", encoding="utf-8")
+        with named(folder / WEIGHTS):
+            (staging / WEIGHTS).write_bytes(weights)
+        with named(folder / CARD):
+            (staging / CARD).write_text(json.dumps(full_card, indent=1) + "\n", encoding="utf-8")
         folder.mkdir(exist_ok=True)
         for name in (WEIGHTS, CARD):
             os.replace(staging / name, folder / name)

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tpcd.errors import FileError
+from tpcd.files import named
 
 BLOCK = 1 << 16
 UPLOAD_PART = 8 << 20
@@ -144,7 +145,8 @@ def _fetch(
         note.write_text(response.headers.get("ETag", ""))
         with part.open("ab" if resumed else "wb") as stream:
             while block := response.read(BLOCK):
-                stream.write(block)
+                with named(part):
+                    stream.write(block)
                 done += len(block)
                 if progress:
                     progress(done, total)

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from tpcd.errors import FileError, OutlineError
+from tpcd.files import named, staged, write_text
 from tpcd.shape.download import Patience, download, file_sha256
 
 BASE_URL = "https://ycb-benchmarks.s3.amazonaws.com/data/google/"
@@ -174,13 +175,17 @@ def extract_mesh(archive: Path, member: str, target: Path) -> None:
                         raise FileError(archive, f"{member} claims {entry.size} bytes")
                     stream = content.extractfile(entry)
                     target.parent.mkdir(parents=True, exist_ok=True)
-                    part.write_bytes(stream.read() if stream else b"")
+                    mesh = stream.read() if stream else b""
+                    with named(target):
+                        part.write_bytes(mesh)
                     found = True
             # The checksum of gzip stands at its very end, behind what tar reads.
             while content.fileobj is not None and content.fileobj.read(1 << 20):
                 pass
     except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is not None:  # a full disk, for one
+            raise
         raise FileError(archive, f"corrupt archive ({error})", "download it again") from None
     if not found:
         raise FileError(archive, f"holds no {member}", "the site may have changed its layout")
@@ -232,9 +237,7 @@ def read_manifest(folder: Path) -> dict[str, Record]:
 def write_manifest(folder: Path, manifest: dict[str, Record]) -> None:
     """Write all records at once."""
     text = json.dumps({name: asdict(manifest[name]) for name in sorted(manifest)}, indent=2)
-    part = folder / "manifest.json.part"
-    part.write_text(text + "\n")
-    os.replace(part, folder / "manifest.json")
+    write_text(folder / "manifest.json", text + "\n")
 
 
 def _views(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -276,7 +279,5 @@ def _thinned(vertices: np.ndarray) -> np.ndarray:
 
 
 def _write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as stream:
+    with staged(path) as part, part.open("wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-    os.replace(part, path)

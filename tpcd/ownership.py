@@ -60,7 +60,7 @@ def owned(path: str | Path, command: str) -> Iterator[None]:
         held.callback(_remove_empty, new)
         _take(held, path, lock)
         me = Owner(command, os.getpid(), socket.gethostname(), f"{datetime.now():%Y-%m-%d %H:%M}")
-        with named(lock):
+        with named(path):
             lock.write_text(json.dumps(asdict(me)), encoding="utf-8")
         for parent in place.parents:
             owner = _owner(lock_of(parent))

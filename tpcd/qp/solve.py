@@ -6,12 +6,11 @@ fallback, the residual, units, and the gradients of differentiate.py.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import torch
 from torch import Tensor
 
 from tpcd.errors import SolverError
+from tpcd.loops import available
 from tpcd.qp.differentiate import attach_gradients
 from tpcd.qp.elastic import relax
 from tpcd.qp.exact import ActiveSet, optimality_residual, solve_exact
@@ -68,7 +67,7 @@ def solve(
 
 def native_available() -> bool:
     """Whether the engine `native` can be used: numba is installed."""
-    return find_spec("numba") is not None
+    return available()
 
 
 def _solve_flat(problem: ContactQP, engine: str, iteration_limit: int | None) -> QPSolution:

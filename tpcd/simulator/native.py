@@ -11,7 +11,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -20,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.contact import ContactScene, place_points
+from tpcd.loops import available
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.simulator.record import DEGREES, StepSettings, Transition
@@ -38,11 +38,6 @@ CHUNK = 64
 _ROWS = 512
 """Rows for which `over_threads` takes one more thread: small torch operations in two threads wait
 for the interpreter, and for each other. By the time that 100 to 3000 latents take to decode."""
-
-
-def available() -> bool:
-    """Whether numba is installed."""
-    return find_spec("numba") is not None
 
 
 def thread_count() -> int:

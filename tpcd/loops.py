@@ -1,0 +1,104 @@
+"""Whether there are compiled loops, and where numba keeps them.
+
+It keeps them beside the sources, else in the user's cache. In a container, or for another user,
+neither may be writable, and numba then refuses to compile at all: here the loops go to a folder of
+the user's own below the temporary one, and without such a folder they are compiled anew in each
+process. That is told. Wherever they go, what is compiled beside the sources goes there first.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import stat
+import sys
+import tempfile
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from types import FunctionType
+from typing import no_type_check
+
+from tpcd import __version__
+
+FOLDERS = tuple(Path(__file__).parent / name for name in ("belief", "effects", "qp", "simulator"))
+"""Where the sources of loops are."""
+
+
+@cache
+def available() -> bool:
+    """Whether numba is installed; if so, it has a place for what it compiles from now on."""
+    if find_spec("numba") is None:
+        return False
+    if any(_kept_in(folder) is None for folder in FOLDERS):
+        _keep_elsewhere()
+    for folder in FOLDERS:
+        beside, place = folder / "__pycache__", _kept_in(folder)
+        if place not in (None, beside):
+            _copy_loops(beside, place)
+    return True
+
+
+@no_type_check
+def _loop():
+    """Stands for a function that numba is to keep."""
+
+
+def _kept_in(folder: Path) -> Path | None:
+    """Where numba keeps loops whose sources are in the folder; None where it finds no place."""
+    from numba.core.caching import FunctionCache
+
+    code = _loop.__code__.replace(co_filename=str(folder / "__init__.py"))
+    try:
+        return Path(FunctionCache(FunctionType(code, {})).cache_path)
+    except RuntimeError:
+        return None
+
+
+def _keep_elsewhere() -> None:
+    from numba.core import config
+    from numba.core.dispatcher import Dispatcher
+
+    unwritable = f"neither {FOLDERS[0].parent} nor a cache of the user can be written"
+    place = _own_folder()
+    if place is None:
+        Dispatcher.enable_caching = lambda self: None
+        print(f"note: {unwritable}, so that each process compiles its loops", file=sys.stderr)
+        return
+    config.CACHE_DIR = str(place)  # type: ignore[attr-defined]
+    os.environ["NUMBA_CACHE_DIR"] = str(place)  # for the processes that this one starts
+    print(f"note: {unwritable}; compiled loops are kept in {place}", file=sys.stderr)
+
+
+def _copy_loops(beside: Path, place: Path) -> None:
+    """Copy what is compiled there, where it is newer; numba asks of which sources it is."""
+    for file in beside.glob("*.nb[ci]"):
+        kept = place / file.name
+        if not kept.exists() or kept.stat().st_mtime < file.stat().st_mtime:
+            part = place / f".{file.name}.{os.getpid()}.part"
+            shutil.copyfile(file, part)
+            os.replace(part, kept)
+
+
+def _own_folder() -> Path | None:
+    """A folder that no other user can write: code in it is run. None where there is none."""
+    try:
+        parent = Path(tempfile.gettempdir())
+    except FileNotFoundError:
+        return None
+    if parent == Path.cwd():  # Python's last resort, which is a folder of somebody's work
+        return None
+    user = os.getuid() if hasattr(os, "getuid") else os.getlogin()
+    place = parent / f"tpcd-{__version__}-{user}"
+    try:
+        place.mkdir(mode=0o700, exist_ok=True)
+        found = place.lstat()
+        others = stat.S_IMODE(found.st_mode) & 0o077
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == user and not others:
+            return place
+    except OSError:
+        pass  # a file or a link that somebody else has put there
+    place = Path(tempfile.mkdtemp(prefix="tpcd-"))
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    return place

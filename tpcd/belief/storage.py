@@ -1,7 +1,7 @@
 """A belief on disk: `belief.safetensors` beside `belief.json`, nothing unpickled.
 
-The JSON names the shape prior by path and by the hash of its weights, since particles mean
-nothing under another prior.
+The JSON says which shape prior it is, by its place and by the hash of its weights, since particles
+mean nothing under another prior.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tpcd.belief.prior import ParameterPrior
 from tpcd.effects.model import effects_from_plain, effects_to_plain
 from tpcd.errors import RunError
 from tpcd.files import read_json, write_bytes, write_json
-from tpcd.shape.checkpoint import load_prior, prior_hash
+from tpcd.shape.checkpoint import load_prior, prior_record, recorded_prior
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 
@@ -44,8 +44,7 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
             "names": list(belief.prior.names),
             "units": list(belief.prior.units),
             "effects": effects_to_plain(belief.prior.effects, fingerprints=True),
-            "prior": str(prior),
-            "prior_sha256": prior_hash(prior),
+            **prior_record(prior, folder),
             "misfit": asdict(belief.misfit),
             "step": asdict(belief.step),
             "log_evidence": belief.log_evidence,
@@ -57,8 +56,8 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
 def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     """Read a belief back, with its shape prior unless `shape` is given.
 
-    Raises `RunError` where the folder holds no belief of this version or its prior is
-    another one than it was made with.
+    Raises `RunError` where the folder holds no belief of this version, `CheckpointError` where its
+    prior is gone or another one than it was made with.
     """
     path = Path(folder) / "belief.json"
     if not path.is_file():
@@ -73,7 +72,7 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
             "estimate again from the episode, or use the tpcd that wrote it",
         )
     try:
-        prior, weights = card["prior"], card["prior_sha256"]
+        place = None if shape is not None else recorded_prior(card, Path(folder))
         misfit, step = MisfitField(**card["misfit"]), StepSettings(**card["step"])
         effects = effects_from_plain(card.get("effects", []), path)
         # JSON has no NaN: the filter `paper` estimates no evidence.
@@ -84,10 +83,8 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(path, f"cannot be read ({error!r})", "estimate again") from error
     if shape is None:
-        if prior_hash(prior) != weights:
-            fault = f"was made with other weights of the prior {prior}"
-            raise RunError(path, fault, "estimate again")
-        shape = load_prior(prior)
+        assert place is not None
+        shape = load_prior(place)
     data = Path(folder) / "belief.safetensors"
     try:
         tensors = load_tensors(data.read_bytes())

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from tpcd.shape.protocol import Misfit
 FORMAT = "tpcd-prior"
 FORMAT_VERSION = 2
 WEIGHTS, CARD = "weights.safetensors", "card.json"
+SHIPPED = Path(__file__).resolve().parents[2] / "checkpoints"
 DENSITIES: dict[str, type[MaskDensity] | type[MixtureDensity]] = {
     "mask": MaskDensity,
     "mixture": MixtureDensity,
@@ -122,18 +123,61 @@ def save_prior(
 
 def find_prior(path_or_name: str | Path) -> Path:
     """Folder of a prior given by path or by name; CheckpointError if there is none."""
+    for candidate in _places(path_or_name):
+        return candidate
+    shipped = sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD}"))
+    known = f"shipped priors are {', '.join(shipped)}" if shipped else "no priors are shipped here"
+    raise CheckpointError(path_or_name, f"holds no prior ({CARD} and {WEIGHTS})", known)
+
+
+def prior_record(path_or_name: str | Path, folder: Path) -> dict[str, str]:
+    """What is written into a folder of the prior that it depends on, so that `recorded_prior` finds
+    the same weights from wherever it is asked, and where both have been moved together."""
+    place = find_prior(path_or_name).resolve()
+    shipped = SHIPPED in place.parents
+    return {
+        "prior": place.name if shipped else str(place),
+        "prior_from_here": Path(os.path.relpath(place, folder.resolve())).as_posix(),
+        "prior_sha256": prior_hash(place),
+    }
+
+
+def recorded_prior(record: Mapping[str, Any], folder: Path) -> Path:
+    """Folder of the prior that a `prior_record` in `folder` tells of; its weights decide.
+
+    Raises `CheckpointError` where it is not to be found, or has other weights now, and `KeyError`
+    where the record is none.
+    """
+    name, weights = str(record["prior"]), record["prior_sha256"]
+    from_here = (
+        [folder.resolve() / record["prior_from_here"]] if "prior_from_here" in record else []
+    )
+    found = [
+        place
+        for candidate in (name, *from_here, Path(name).name)
+        for place in _places(candidate)
+        if (place / WEIGHTS).is_file()
+    ]
+    for place in found:
+        if prior_hash(place) == weights:
+            return place
+    places = ", ".join(dict.fromkeys(map(str, found or [name])))
+    fault = f"has other weights than when {folder} was made"
+    if not found:
+        fault = f"holds no prior any more, but {folder} was made with it"
+    raise CheckpointError(places, fault, "put the prior back, or estimate again")
+
+
+def _places(path_or_name: str | Path) -> Iterator[Path]:
+    """Folders with a prior that a path or a name may mean, the first one first."""
     given = Path(path_or_name)
-    repository = Path(__file__).resolve().parents[2] / "checkpoints"
     candidates = [given]
     if len(given.parts) == 1:
-        roots = (Path("checkpoints"), repository)
+        roots = (Path("checkpoints"), SHIPPED)
         candidates += [root / sub / given for root in roots for sub in ("", "evaluation")]
     for candidate in candidates:
         if (candidate / CARD).is_file() or (candidate / WEIGHTS).is_file():
-            return candidate
-    shipped = sorted(card.parent.name for card in repository.glob(f"*/{CARD}"))
-    known = f"shipped priors are {', '.join(shipped)}" if shipped else "no priors are shipped here"
-    raise CheckpointError(given, f"holds no prior ({CARD} and {WEIGHTS})", known)
+            yield candidate
 
 
 def prior_hash(path_or_name: str | Path) -> str:

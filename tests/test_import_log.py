@@ -31,6 +31,7 @@ from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import LogError
 from tpcd.logs.plane import Plane, WrenchReading, project
 from tpcd.logs.settled import Stillness, find_holds, find_settled
+from tpcd.quality.finding import Finding, Weight
 
 WINDOW_SAMPLES = 51
 ROW_STD = np.array(SAMPLE_STD) / math.sqrt(WINDOW_SAMPLES)
@@ -124,6 +125,40 @@ def test_holds_that_end_while_the_arm_moves_are_left_out_and_told() -> None:
     strict = choices_of(Setting(), stillness=Stillness(window=1.7))
     with pytest.raises(LogError, match=r"no command is held for 1.7 s|shorter than 1.7 s"):
         import_log(log_of(Setting(), slow), strict)
+
+
+def test_steps_use_only_samples_that_no_finding_leaves_out() -> None:
+    step = HOLD + RAMP
+    # Samples that are there, such as those of a frozen sensor, at the end of the fifth hold; then
+    # a time in which none came, within the window of the eighth; then one before its window.
+    frozen = (5 * step - 0.2, 5 * step - 0.1)
+    silent = (8 * step - 0.4, 8 * step - 0.2)
+    early = (10 * step - 1.2, 10 * step - 0.9)
+    log = log_of(Setting(), SAMPLES)
+    findings = tuple(
+        Finding("gap", Weight.LEFT_OUT, "left out", (), start, end)
+        for start, end in (frozen, silent, early)
+    )
+    inside = (log.times > silent[0]) & (log.times < silent[1])
+    log = replace(log, findings=findings).only(~inside)
+    found = import_log(log, choices_of(Setting()))
+    assert len(found.settled.rows) == len(EPISODE) - 2
+    assert np.allclose(found.settled.broken, [5 * step - 1 / RATE, 8 * step - 1 / RATE])
+    kept = np.delete(np.arange(len(EPISODE)), [4, 7])
+    assert np.allclose(found.settled.rows[:, :3], EPISODE.poses.numpy()[kept], atol=1e-3)
+    told = " ".join(found.account.findings)
+    assert "2 stretches make no row" in told and "9.5, 15.2 s" in told
+    assert "left out: left out" in told
+    doubted = replace(log, findings=(Finding("unit", Weight.DOUBT, "looks odd"),))
+    assert "looks odd" in import_log(doubted, choices_of(Setting())).account.doubts
+
+
+def test_without_set_points_stretches_that_are_left_out_make_no_row() -> None:
+    log = replace(log_of(Setting(), SAMPLES), command_positions=None, command_rotations=None)
+    count = len(import_log(log, choices_of(Setting())).settled.rows)
+    gap = Finding("gap", Weight.LEFT_OUT, "no samples", (), 10.1, 11.4)
+    found = import_log(replace(log, findings=(gap,)), choices_of(Setting()))
+    assert len(found.settled.rows) == count - 3 and len(found.settled.broken) == 3
 
 
 def test_noise_of_rows_counts_what_is_correlated() -> None:

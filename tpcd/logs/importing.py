@@ -26,6 +26,7 @@ from tpcd.logs.findings import Account, compare_readings, left_out, spring_wrenc
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog, Plane, WrenchReading, project
 from tpcd.logs.settled import Settled, Stillness, find_settled
+from tpcd.quality.finding import Weight
 
 FREE_FORCE = 1.0
 """A start that is pressed harder than this by K (x - u) is not free [N]."""
@@ -85,8 +86,15 @@ def import_log(log: Log, choices: Importing) -> Imported:
     stiffness = np.array(choices.stiffness)
     outside = left_out(planar)
     read = compare_readings(log, choices.plane, choices.wrench, settled, stiffness)
-    findings = [*log.notes, *_counted(log, planar, settled), *outside.findings, *read.findings]
-    doubts = [*outside.doubts, *read.doubts]
+    told = _told(log)
+    findings = [
+        *log.notes,
+        *told.findings,
+        *_counted(log, planar, settled),
+        *outside.findings,
+        *read.findings,
+    ]
+    doubts = [*told.doubts, *outside.doubts, *read.doubts]
     restless = _restless(settled, choices.stillness)
     std = choices.sensor_std
     if std is None and not restless:
@@ -118,8 +126,8 @@ def import_log(log: Log, choices: Importing) -> Imported:
         account = Account(tuple(findings), tuple(doubts))
         return Imported(planar, settled, spring, account, content, header)
     episode, finding = _episode(log, settled, header, extra)
-    told = check_episode(episode)
-    doubts += [line for line in told if not (read.doubts and "times K (pose" in line)]
+    doubted = check_episode(episode)
+    doubts += [line for line in doubted if not (read.doubts and "times K (pose" in line)]
     try:
         doubts += check_noise(episode)
     except EpisodeError as error:
@@ -140,7 +148,10 @@ def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
         return
     window = choices.stillness.window
     found = f"{len(settled.rows)} settled steps in {log.times[-1]:.3g} s"
-    if settled.unsettled:
+    if settled.broken:
+        problem = f"{len(settled.broken)} of them lie in what is left out"
+        remedy = "; ".join(str(f) for f in log.findings if f.weight is Weight.LEFT_OUT)
+    elif settled.unsettled:
         problem = f"{len(settled.unsettled)} holds end while the arm still moves"
         remedy = "allow more --drift, or record longer holds"
     elif settled.brief:
@@ -151,23 +162,40 @@ def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
     raise LogError(log.path, f"{found}, expected a free start and one more: {problem}", remedy)
 
 
+def _told(log: Log) -> Account:
+    """What was found in the recording itself."""
+    doubts = (Weight.DOUBT, Weight.SERIOUS)
+    return Account(
+        tuple(f"{each.weight.value}: {each}" for each in log.findings if each.weight not in doubts),
+        tuple(str(each) for each in log.findings if each.weight in doubts),
+    )
+
+
 def _counted(log: Log, planar: PlanarLog, settled: Settled) -> list[str]:
     steps = np.diff(log.times)
     rate = f"{len(log)} samples in {log.times[-1]:.3g} s (every {1e3 * np.median(steps):.2g} ms"
     rate += f", at most {1e3 * steps.max():.3g} ms)"
     if planar.commands is None:
-        return [f"{rate}, in {len(settled.rows)} stretches"]
-    told = [f"{rate}, {len(settled.rows)} settled steps"]
+        told = [f"{rate}, in {len(settled.rows)} stretches"]
+    else:
+        told = [f"{rate}, {len(settled.rows)} settled steps"]
+    if settled.broken:
+        told.append(
+            f"{len(settled.broken)} stretches make no row, for part of them is left out:"
+            f" they end at {_times(settled.broken)} s; the steps after them went by way of them"
+        )
     if settled.unsettled:
-        times = ", ".join(f"{time:.1f}" for time in settled.unsettled[:5])
         told.append(
             f"{len(settled.unsettled)} holds left out, for the arm still moved at their ends"
-            f" ({times} s{', …' if len(settled.unsettled) > 5 else ''}); the steps after them went"
-            " by way of them"
+            f" ({_times(settled.unsettled)} s); the steps after them went by way of them"
         )
     if settled.brief:
         told.append(f"{settled.brief} holds too short for a row")
     return told
+
+
+def _times(times: tuple[float, ...]) -> str:
+    return ", ".join(f"{time:.1f}" for time in times[:8]) + (", …" if len(times) > 8 else "")
 
 
 def _restless(settled: Settled, stillness: Stillness) -> list[int]:

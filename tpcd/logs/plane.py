@@ -18,6 +18,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tpcd.logs.log import AXES, Log, LogError
+from tpcd.quality.finding import Finding
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,8 @@ class PlanarLog:
     """Motion out of the plane since the start [m], and rotation not about its axis [rad]."""
     wrench_left_out: Float[np.ndarray, "n 3"]
     """Force out of the plane, and torque about x and z [N, N·m, N·m]."""
+    findings: tuple[Finding, ...] = ()
+    """What checks of the recording found, by `times`."""
 
 
 def project(log: Log, plane: Plane, wrench: WrenchReading) -> PlanarLog:
@@ -117,6 +120,7 @@ def project(log: Log, plane: Plane, wrench: WrenchReading) -> PlanarLog:
         commands,
         np.column_stack((place[:, 2] - place[0, 2], swing)),
         np.column_stack((force @ axis, torque @ directions[:2].T)),
+        log.findings,
     )
 
 

@@ -5,6 +5,9 @@ scatter of their means, halved, is the noise of the row (batch means: Law and Ke
 Modeling and Analysis", on the variance of a correlated series' mean), so noise that is correlated
 for less than a block counts in full. What changes from one stretch to another, such as drift of the
 sensor, does not show in it.
+
+A stretch is whole: where a finding leaves out any of it, be it samples that are there or a time
+in which none came, it makes no row.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from jaxtyping import Float, Int
 
 from tpcd.data.noise import resolution
 from tpcd.logs.plane import PlanarLog
+from tpcd.quality.finding import overlapping
 
 BLOCKS = 4
 HELD = (1e-5, 1e-5, 1e-5)
@@ -56,6 +60,8 @@ class Settled:
     """Times at which holds ended that were left out because the arm still moved [s]."""
     brief: int
     """Holds too short for a row."""
+    broken: tuple[float, ...] = ()
+    """Times at which stretches ended that findings leave out, in whole or in part [s]."""
 
 
 def find_settled(log: PlanarLog, stillness: Stillness) -> Settled:
@@ -66,22 +72,26 @@ def find_settled(log: PlanarLog, stillness: Stillness) -> Settled:
     """
     if log.commands is None:
         stretches = _windows(log.times, stillness.window)
-        return _rows(log, stretches, None, (), 0)
+        whole = np.array([_whole(log, int(a), int(b)) for a, b in stretches], dtype=bool)
+        broken = tuple(log.times[stretches[~whole, 1] - 1].tolist())
+        return _rows(log, stretches[whole], None, (), 0, broken)
     holds = find_holds(log.commands)
     ends = log.times[holds[:, 1] - 1]
     long = ends - log.times[holds[:, 0]] >= stillness.window
     brief = int(((ends - log.times[holds[:, 0]] >= stillness.window / 5) & ~long).sum())
-    stretches, unsettled = [], []
+    stretches, unsettled, broken = [], [], []
     for (_, end), time in zip(holds[long], ends[long], strict=True):
         first = int(np.searchsorted(log.times, time - stillness.window))
-        if end - first < 2 * BLOCKS:
+        if not _whole(log, first, int(end)):
+            broken.append(float(time))
+        elif end - first < 2 * BLOCKS:
             brief += 1
         elif _still(log, first, int(end), stillness):
             stretches.append((first, int(end)))
         else:
             unsettled.append(float(time))
     found = np.array(stretches, dtype=np.int64).reshape(-1, 2)
-    return _rows(log, found, log.commands, tuple(unsettled), brief)
+    return _rows(log, found, log.commands, tuple(unsettled), brief, tuple(broken))
 
 
 def find_holds(commands: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "h 2"]:
@@ -103,6 +113,11 @@ def _windows(times: Float[np.ndarray, " n"], window: float) -> Int[np.ndarray, "
     return pairs[pairs[:, 1] - pairs[:, 0] >= 2 * BLOCKS].astype(np.int64)
 
 
+def _whole(log: PlanarLog, first: int, end: int) -> bool:
+    """Whether no finding leaves out any of the time from one sample to another."""
+    return not overlapping(float(log.times[first]), float(log.times[end - 1]), log.findings)
+
+
 def _still(log: PlanarLog, first: int, end: int, stillness: Stillness) -> bool:
     values = np.column_stack((log.poses[first:end], log.wrenches[first:end]))
     half = len(values) // 2
@@ -119,6 +134,7 @@ def _rows(
     commands: Float[np.ndarray, "n 3"] | None,
     unsettled: tuple[float, ...],
     brief: int,
+    broken: tuple[float, ...] = (),
 ) -> Settled:
     values = np.column_stack((log.poses, log.wrenches))
     rows, squares = np.empty((len(stretches), 6)), np.zeros((len(stretches), 6))
@@ -133,4 +149,4 @@ def _rows(
         held = held[:, :3]
     least = np.array([resolution(column) for column in values.T]) / np.sqrt(12.0)
     noise = np.maximum(np.sqrt(squares.mean(0)), least) if len(rows) else np.full(6, np.nan)
-    return Settled(stretches, rows, held, noise, unsettled, brief)
+    return Settled(stretches, rows, held, noise, unsettled, brief, broken)

@@ -52,6 +52,19 @@ class Finding:
         return self.sentence + (f"; {self.remedy}" if self.remedy else "")
 
 
+def overlapping(start: float, end: float, findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The findings that leave out anything between two times [s], whether or not samples lie there.
+
+    A stretch that only touches what is left out, where a gap begins or ends, is whole.
+    """
+    return tuple(
+        each
+        for each in findings
+        if each.weight is Weight.LEFT_OUT and each.start is not None and each.end is not None
+        if each.start < end and start < each.end
+    )
+
+
 def usable(times: Float[np.ndarray, " n"], findings: Iterable[Finding]) -> Bool[np.ndarray, " n"]:
     """Which samples at `times` [s since the first] no finding leaves out."""
     kept = np.ones(len(times), dtype=bool)

@@ -40,6 +40,9 @@ class LogImport:
     """Topics of a bag, as pose=TOPIC, wrench=TOPIC, command=TOPIC; needed where several fit."""
     euler: str = "ZYX"
     """Axes of Euler angles e1 e2 e3; capitals for axes that turn along."""
+    delay: tuple[str, ...] = ()
+    """How late a stream is, as wrench=SECONDS, command=SECONDS or pose=SECONDS, to be taken earlier;
+    or auto, as motion and force tell."""
     rate: float | None = None
     """Samples a second [Hz], for tables without times."""
     start: float | None = None
@@ -161,16 +164,20 @@ def _read(config: LogImport) -> Log:
     """The recording, by what kind of file it is."""
     from tpcd.logs.bags import is_bag, read_bag
     from tpcd.logs.columns import log_from_columns
+    from tpcd.logs.joining import parse_delays
     from tpcd.logs.table import read_columns
 
+    delays = parse_delays(config.delay)
     if is_bag(config.log):
         if config.map:
             raise ValueError("map is for tables; name a bag's topics with --topics")
-        return read_bag(config.log, config.topics)
+        return read_bag(config.log, config.topics, delays)
     if config.topics:
         raise ValueError("topics are for bags; name a table's columns with --map")
     columns = read_columns(config.log)
-    return log_from_columns(columns, config.map, config.log, config.euler, config.rate, config.keep)
+    return log_from_columns(
+        columns, config.map, config.log, config.euler, config.rate, config.keep, delays
+    )
 
 
 def _joined(poses, wrenches):

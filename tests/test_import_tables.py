@@ -155,7 +155,7 @@ def test_rows_that_lack_a_number_and_repeated_times_are_told(tmp_path: Path) -> 
     log = log_from_columns(read_columns(path), MAP, path)
     assert len(log) == len(table["t"]) - 4
     assert log.notes == (
-        f"3 of {len(table['t'])} rows lack a number and are left out",
+        f"3 of {len(table['t'])} rows lack a number and are left out (F_x; first in line 5)",
         "1 samples repeat the time before and are left out",
     )
 
@@ -173,7 +173,7 @@ BAD_MAPS = {
     "half a set point": (without("u_x"), "a set point needs u_x and u_z"),
     "half a quaternion": (without("qw"), "expected all of qx, qy, qz, qw alone"),
     "two rotations": ([*MAP, "phi=qx"], "expected all of qx, qy, qz, qw alone"),
-    "no time": (without("time"), "no column of times; map it (time=COLUMN) or give --rate"),
+    "no time": (without("time"), "time not in the map; the columns are t, x, y"),
     "text": ([*without("x"), "x=word"], "column 'word' holds 'w'"),
 }
 
@@ -191,7 +191,7 @@ BAD_FILES = {
     "missing": (None, "no such file"),
     "empty": ("", "the file is empty"),
     "only names": ("t,x\n", "no rows below the line of names"),
-    "ragged": ("t,x\n1,2\n3\n", "cannot be read as a table"),
+    "ragged": ("t,x\n1,2\n3\n4,5\n", "line 3 has 1 cells, expected 2"),
     "twice": ("t,t\n1,2\n", "appears twice"),
     "no text": (b"\xff\xfe\x00t\x00", "cannot be read as a table"),
     "no parquet": ("t,x\n1,2\n", "cannot be read as a table"),

@@ -2,50 +2,32 @@
 
 Poses and set points are geometry_msgs/PoseStamped, wrenches WrenchStamped. The samples are those of
 the pose; wrenches are interpolated to its times, a set point holds until the next one comes. Times
-are those of the headers, or of the recorder where the headers have none.
+are those of the headers, or of the recorder where the headers have none or jump.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from tpcd.logs.columns import in_order
+from tpcd.logs.joining import join
 from tpcd.logs.log import Log, LogError
+from tpcd.logs.recorded import Recorded, common_clock, places
+from tpcd.logs.suggest import COMMAND_WORDS
+from tpcd.quality.stream import Stream
 
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
 KINDS = {"pose": POSE, "wrench": WRENCH, "command": POSE}
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+CHANNELS = {
+    "pose": _POSE,
+    "wrench": ("F_x", "F_y", "F_z", "T_x", "T_y", "T_z"),
+    "command": tuple(f"u_{name}" for name in _POSE),
+}
 SUFFIXES = (".bag", ".mcap", ".db3")
-COMMAND_WORDS = (
-    "command",
-    "cmd",
-    "target",
-    "desired",
-    "setpoint",
-    "set_point",
-    "reference",
-    "goal",
-    "equilibrium",
-)
-"""A topic whose name has one of these is taken for the set point."""
-
-
-@dataclass(frozen=True)
-class Topic:
-    """Messages of one topic in order of time."""
-
-    name: str
-    frame: str
-    times: Float[np.ndarray, " k"]
-    """[s]"""
-    values: Float[np.ndarray, "k w"]
-    """Position and quaternion (x, y, z, w), or force and torque."""
 
 
 def is_bag(path: Path) -> bool:
@@ -53,8 +35,11 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES or path.is_dir()
 
 
-def read_bag(path: Path, topics: Sequence[str] = ()) -> Log:
-    """The recording in a bag; `topics` read pose=TOPIC, wrench=TOPIC, command=TOPIC.
+def read_bag(
+    path: Path, topics: Sequence[str] = (), delays: Mapping[str, float] | None = None
+) -> Log:
+    """The recording in a bag; `topics` read pose=TOPIC, wrench=TOPIC, command=TOPIC, and `delays`
+    say how late each is [s].
 
     Raises `LogError` for a bag that cannot be read and for topics that are missing or of another
     type, `ValueError` for malformed `topics`.
@@ -75,12 +60,12 @@ def read_bag(path: Path, topics: Sequence[str] = ()) -> Log:
             types = {c.topic: c.msgtype for c in reader.connections}
             chosen = choose_topics(types, named, path)
             read = {role: _read(reader, topic, path) for role, topic in chosen.items()}
+        return _joined(path, read, delays)
     except (AnyReaderError, OSError, ValueError) as error:
         if isinstance(error, LogError):
             raise
         problem = " ".join(str(error).split())
         raise LogError(path, f"cannot be read as a bag ({problem})", "record it again") from error
-    return in_order(_joined(path, read))
 
 
 def choose_topics(types: dict[str, str], named: dict[str, str], path: Path) -> dict[str, str]:
@@ -120,14 +105,14 @@ def _named(topics: Sequence[str]) -> dict[str, str]:
     return named
 
 
-def _read(reader: Any, name: str, path: Path) -> Topic:
+def _read(reader: Any, name: str, path: Path) -> Recorded:
     connections = [c for c in reader.connections if c.topic == name]
-    times, values, frames = [], [], set()
-    for connection, recorded, raw in reader.messages(connections=connections):
+    recorded, stamps, values, frames = [], [], [], set()
+    for connection, time, raw in reader.messages(connections=connections):
         message = reader.deserialize(raw, connection.msgtype)
         stamp = message.header.stamp
-        time = stamp.sec + 1e-9 * stamp.nanosec
-        times.append(time if time else 1e-9 * recorded)
+        recorded.append(time)
+        stamps.append(1_000_000_000 * stamp.sec + stamp.nanosec)
         frames.add(message.header.frame_id)
         if connection.msgtype == POSE:
             p, q = message.pose.position, message.pose.orientation
@@ -140,56 +125,37 @@ def _read(reader: Any, name: str, path: Path) -> Topic:
     if len(frames) > 1:
         found = ", ".join(sorted(frames))
         raise LogError(path, f"topic {name!r} changes its frame ({found})", "split the recording")
-    order = np.argsort(times, kind="stable")
-    return Topic(name, frames.pop(), np.array(times)[order], np.array(values, dtype=float)[order])
-
-
-def _joined(path: Path, read: dict[str, Topic]) -> Log:
-    """All topics at the times of the pose, where all of them have begun and none has ended."""
-    pose, wrench, command = read["pose"], read["wrench"], read.get("command")
-    begin = max(topic.times[0] for topic in read.values())
-    end = min(pose.times[-1], wrench.times[-1])
-    during = (pose.times >= begin) & (pose.times <= end)
-    if during.sum() < 2:
-        spans = "; ".join(
-            f"{t.name} {t.times[0]:.2f} to {t.times[-1]:.2f} s" for t in read.values()
-        )
-        raise LogError(path, f"the topics do not overlap in time ({spans})", "check the clocks")
-    times, poses = pose.times[during], pose.values[during]
-    forces = np.stack(
-        [np.interp(times, wrench.times, column) for column in wrench.values.T], axis=1
+    times = np.array(recorded, dtype=np.int64)
+    at = places(reader, connections, times)
+    order = np.argsort(at, kind="stable")
+    return Recorded(
+        name,
+        frames.pop(),
+        at[order],
+        times[order],
+        np.array(stamps, dtype=np.int64)[order],
+        np.array(values, dtype=np.float64)[order],
     )
+
+
+def _joined(path: Path, read: dict[str, Recorded], delays: Mapping[str, float] | None) -> Log:
+    pose, wrench, command = read["pose"], read["wrench"], read.get("command")
     notes = [f"pose is {pose.name} in {pose.frame!r}, wrench is {wrench.name} in {wrench.frame!r}"]
     if wrench.frame != pose.frame:
         notes.append(
             "the frames differ: if the wrench is in axes of the tool, give --wrench_frame tool"
         )
-    if command is None:
-        return Log(path, times, poses[:, :3], _rotations(poses, pose, path), forces[:, :3],
-                   forces[:, 3:], notes=tuple(notes))  # fmt: skip
-    notes.append(f"set point is {command.name} in {command.frame!r}")
-    if command.frame != pose.frame:
-        raise LogError(
-            path,
-            f"the pose is in {pose.frame!r}, the set point in {command.frame!r}",
-            "record both in one frame",
-        )
-    targets = command.values[np.searchsorted(command.times, times, side="right") - 1]
-    return Log(
-        path,
-        times,
-        poses[:, :3],
-        _rotations(poses, pose, path),
-        forces[:, :3],
-        forces[:, 3:],
-        targets[:, :3],
-        _rotations(targets, command, path),
-        notes=tuple(notes),
-    )
-
-
-def _rotations(poses: Float[np.ndarray, "k 7"], topic: Topic, path: Path) -> Rotation:
-    try:
-        return Rotation.from_quat(poses[:, 3:])
-    except ValueError as error:
-        raise LogError(path, f"topic {topic.name!r}: {error}", "record unit quaternions") from error
+    if command is not None:
+        notes.append(f"set point is {command.name} in {command.frame!r}")
+        if command.frame != pose.frame:
+            raise LogError(
+                path,
+                f"the pose is in {pose.frame!r}, the set point in {command.frame!r}",
+                "record both in one frame",
+            )
+    times, stamps, findings = common_clock(list(read.values()))
+    streams = [
+        Stream(topic.name, CHANNELS[role], own, topic.values, stamped)
+        for (role, topic), own, stamped in zip(read.items(), times, stamps, strict=True)
+    ]
+    return join(path, streams, delays=delays, findings=findings, notes=notes)

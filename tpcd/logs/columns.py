@@ -12,33 +12,32 @@ An entry reads `NAME=COLUMN` or `NAME=COLUMN:UNIT`. The names are
 
 where `pose` and `command` have six entries (with a rotation vector) or seven (with a quaternion).
 Recordings of Universal Robots' RTDE need no map: `actual_TCP_pose` and `actual_TCP_force` are
-found by their names.
+found by their names. A unit that the map does not give is taken from the table, where a line of
+units or the name of the column has one, and for whole numbers since 1970 from their size.
 """
 
 from __future__ import annotations
 
 import difflib
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from tpcd.logs.joining import join
 from tpcd.logs.log import Log, LogError
-from tpcd.logs.table import Columns
+from tpcd.logs.suggest import suggest_map
+from tpcd.logs.table import Columns, Table, place, text_among_numbers, units_of
+from tpcd.quality.clocks import JUMP
+from tpcd.quality.stream import Stream
 
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}
 _FORCES = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
 _TORQUES = {"Nm": 1.0, "mNm": 1e-3, "Nmm": 1e-3, "Ncm": 1e-2}
 _TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-ROTATIONS = {
-    "rotation vector": ("rx", "ry", "rz"),
-    "quaternion": ("qx", "qy", "qz", "qw"),
-    "Euler angles": ("e1", "e2", "e3"),
-    "planar angle": ("phi",),
-}
 _POSE_UNITS: dict[str, dict[str, float]] = {
     **dict.fromkeys(("x", "y", "z"), _LENGTHS),
     **dict.fromkeys(("rx", "ry", "rz", "e1", "e2", "e3", "phi"), _ANGLES),
@@ -66,12 +65,12 @@ RTDE = {
 admittance loop is not the set point of the impedance, so no command is taken by itself."""
 
 
-def parse_map(entries: Sequence[str], columns: Columns, path: Path) -> dict[str, tuple[str, float]]:
-    """Name to column and factor to SI, for columns that exist.
+def parse_map(entries: Sequence[str], columns: Columns, path: Path) -> dict[str, tuple[str, str]]:
+    """Name to column and unit ("" where the map gives none), for columns that exist.
 
     Raises `ValueError` for a malformed entry, `LogError` for a column that is not there.
     """
-    found: dict[str, tuple[str, float]] = {}
+    found: dict[str, tuple[str, str]] = {}
     given = dict(_split(entry) for entry in entries)
     if f"{RTDE['pose']}_0" in columns:
         given = {n: c for n, c in RTDE.items() if c in columns or f"{c}_0" in columns} | given
@@ -80,7 +79,7 @@ def parse_map(entries: Sequence[str], columns: Columns, path: Path) -> dict[str,
             there = [names for names in GROUPS[name] if f"{column}_{len(names) - 1}" in columns]
             if not there:
                 _find(f"{column}_{len(GROUPS[name][0]) - 1}", columns, path)
-            found.update({n: (f"{column}_{k}", 1.0) for k, n in enumerate(there[-1])})
+            found.update({n: (f"{column}_{k}", "") for k, n in enumerate(there[-1])})
     for name, column in given.items():
         if name in GROUPS:
             continue
@@ -92,7 +91,7 @@ def parse_map(entries: Sequence[str], columns: Columns, path: Path) -> dict[str,
         if unit and unit not in UNITS[name]:
             raise ValueError(f"map: {name} in {unit!r}, expected one of {', '.join(UNITS[name])}")
         _find(column, columns, path)
-        found[name] = column, UNITS[name][unit] if unit else 1.0
+        found[name] = column, unit
     return found
 
 
@@ -103,96 +102,144 @@ def log_from_columns(
     euler: str = "ZYX",
     rate: float | None = None,
     keep: Sequence[str] = (),
+    delays: Mapping[str, float] | None = None,
 ) -> Log:
     """The recording in a table; `euler` are scipy's axes, capitals for turning axes.
 
-    `rate` [Hz] stands in for a column of times. Rows that lack a number are left out, and so
-    are repeated times; notes say so. Raises `LogError` and `ValueError` in one line.
+    `rate` [Hz] stands in for a column of times, and `delays` say how late pose, wrench or command
+    are [s]. Rows that lack a number are left out, and so are repeated times; notes say so. Where
+    pose and wrench stand in rows of their own, each with its times, they are joined like topics.
+    Raises `LogError` and `ValueError` in one line.
     """
     mapped = parse_map(entries, columns, path)
-    values: dict[str, np.ndarray] = {}
-    for name, (column, factor) in mapped.items():
-        if columns[column].dtype.kind != "f":
-            example = next(iter(columns[column]))
-            raise LogError(path, f"column {column!r} holds {str(example)!r}", "expected numbers")
-        values[name] = factor * columns[column]
     for column in keep:
         _find(column, columns, path)
+    missing = _check_map(mapped, columns, path, rate)
+    values, notes = read_numbers(columns, mapped, path)
     count = len(next(iter(columns.values())))
-    if "time" not in values:
-        if rate is None:
-            raise LogError(path, "no column of times", "map it (time=COLUMN) or give --rate in Hz")
-        values["time"] = np.arange(count) / rate
-    missing = {n for n in (*"xyz", "F_x", "F_y", "F_z", "T_x", "T_y", "T_z") if n not in values}
-    if {"x", "z"} & missing or {"F_x", "F_z"} & missing:
+    times = values.pop("time", None)
+    times = np.arange(count) / (rate or 1.0) if times is None else times
+    timed = np.flatnonzero(np.isfinite(times))
+    _check_order(columns, times, timed, path)
+    groups: dict[str, list[str]] = {"pose": [], "wrench": [], "command": []}
+    for name in values:
+        kind = "command" if name.startswith("u_") else "wrench" if name[0] in "FT" else "pose"
+        groups["wrench" if name == "tau" else kind].append(name)
+    full = {
+        kind: timed[np.isfinite(np.stack([values[n][timed] for n in names])).all(0)]
+        for kind, names in groups.items()
+        if names
+    }
+    whole = functools.reduce(np.intersect1d, full.values())
+    apart = 2 * len(whole) < len(full["pose"]) and all(len(rows) for rows in full.values())
+    if apart:
+        told = ", ".join(f"{kind} in {len(rows)}" for kind, rows in full.items())
+        notes.append(f"of {count} rows {told} hold numbers: joined by their times, each for itself")
+    elif len(whole) < count:
+        lacking = np.setdiff1d(np.arange(count), whole)
+        empty = [n for n in values if not np.isfinite(values[n][lacking]).all()]
+        empty += ["time"] if len(timed) < count else []
+        notes.append(
+            f"{len(lacking)} of {count} rows lack a number and are left out ({', '.join(empty)};"
+            f" first in {place(columns, int(lacking[0]))})"
+        )
+    streams = []
+    for kind, rows in full.items():
+        rows = rows if apart else timed
+        block = np.stack([values[name][rows] for name in groups[kind]], axis=1)
+        streams.append(Stream(path.name, tuple(groups[kind]), times[rows], block))
+    extra = {name: columns[name][full["pose"] if apart else timed] for name in keep}
+    return join(path, streams, euler, delays, (), notes, missing, extra)
+
+
+def read_numbers(
+    columns: Columns, mapped: Mapping[str, tuple[str, str]], path: Path
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The mapped columns in SI units, and which units were taken from where; times since the first.
+
+    Raises `LogError` for a column that holds text, with the line and what stands there.
+    """
+    values, notes = {}, list(columns.notes) if isinstance(columns, Table) else []
+    given = units_of(columns)
+    for name, (column, unit) in mapped.items():
+        content = columns[column]
+        if content.dtype.kind not in "fiu":
+            raise LogError(path, *text_among_numbers(columns, column))
+        if name == "time" and isinstance(columns, Table) and column in columns.moments:
+            unit = columns.moments[column]
+        elif not unit and (found := given.get(column)):
+            unit = found if found in UNITS[name] else ""
+            ending = "" if unit else f"; that is no unit of {name}, and not used"
+            notes.append(f"column {column!r} is in {found} by the table{ending}")
+        if name == "time":
+            if not unit and (unit := since_1970(content)):
+                notes.append(f"column {column!r} is read as {unit} since 1970")
+            # Whole nanoseconds are subtracted as such: a float holds them to 256 ns only.
+            content = content - _first(content)
+            content = content.astype(np.int64) if content.dtype.kind == "u" else content
+        values[name] = UNITS[name][unit or next(iter(UNITS[name]))] * content.astype(np.float64)
+    return values, notes
+
+
+def since_1970(times: np.ndarray) -> str:
+    """The unit of times that can only be ns, us or ms since 1970, else "".
+
+    They must lie between 2001 and 2036, and follow each other by 10 us to 100 s.
+    """
+    held = times[np.isfinite(times)]
+    if len(held) < 2:
+        return ""
+    spacing = float(np.median(np.abs(np.diff(held.astype(np.float64)))))
+    for unit in ("ns", "us", "ms"):
+        per_second = 1.0 / _TIMES[unit]
+        if 1e9 < float(held[0]) / per_second < 2.1e9 and 1e-5 < spacing / per_second < 100.0:
+            return unit
+    return ""
+
+
+def _first(times: np.ndarray) -> np.generic | float:
+    held = np.flatnonzero(np.isfinite(times))
+    return times[held[0]] if len(held) else 0.0
+
+
+def _check_map(
+    mapped: Mapping[str, object], columns: Columns, path: Path, rate: float | None
+) -> frozenset[str]:
+    """Components that the map leaves out; raises `LogError` for those that must be there."""
+    names = set(mapped) | ({"T_y"} if "tau" in mapped else set())
+    lacking = {"x", "z", "F_x", "F_z"} - names
+    if "time" not in names and rate is None:
+        lacking |= {"time"}
+    if lacking:
+        fitting = [entry for entry in suggest_map(columns) if entry.split("=")[0] not in names]
+        remedy = f"the columns are {_listed(columns)}"
+        if fitting:
+            remedy += f"; by their names, try --map {' '.join(fitting)}"
+        time = "; give --rate in Hz where there are no times" if "time" in lacking else ""
+        raise LogError(path, f"{', '.join(sorted(lacking))} not in the map", remedy + time)
+    missing = {n for n in (*"xyz", "F_x", "F_y", "F_z", "T_x", "T_y", "T_z") if n not in names}
+    if any(name.startswith("u_") for name in names):
+        if {"u_x", "u_z"} - names:
+            raise LogError(path, "a set point needs u_x and u_z", "map both, or neither")
+        missing |= {f"u_{name}" for name in "xyz" if f"u_{name}" not in names}
+    return frozenset(missing)
+
+
+def _check_order(columns: Columns, times: np.ndarray, timed: np.ndarray, path: Path) -> None:
+    """Raises `LogError` where the only clock of a table goes back."""
+    if not len(timed):
+        raise LogError(path, "no row has a time", "check the map of columns")
+    held = times[timed]
+    back = np.flatnonzero(np.diff(held) < -JUMP)
+    if len(back):
+        k = int(back[0])
+        more = f", and {len(back) - 1} times more" if len(back) > 1 else ""
         raise LogError(
             path,
-            f"{', '.join(sorted({'x', 'z', 'F_x', 'F_z'} & missing))} not in the map",
-            f"add NAME=COLUMN; the columns are {', '.join(list(columns)[:40])}",
-        )
-    commanded = any(name.startswith("u_") for name in values)
-    if commanded:
-        missing |= {f"u_{name}" for name in "xyz" if f"u_{name}" not in values}
-        if {"u_x", "u_z"} & missing:
-            raise LogError(path, "a set point needs u_x and u_z", "map both, or neither")
-    good = np.all([np.isfinite(column) for column in values.values()], axis=0)
-    notes = []
-    if not good.all():
-        notes.append(f"{int((~good).sum())} of {count} rows lack a number and are left out")
-        values = {name: column[good] for name, column in values.items()}
-    if not len(values["time"]):
-        raise LogError(path, "no row has all the numbers of the map", "check the map of columns")
-    if "tau" in values:
-        # phi turns from x to z, about -y.
-        values["T_y"] = -values["tau"]
-        missing.discard("T_y")
-    rotations, kind = _rotations(values, "", euler, path)
-    turned = None
-    if rotations is None:
-        notes.append("no rotation in the map: taken as constant")
-        rotations = Rotation.identity(len(values["time"]))
-        missing.add("rotation")
-    if commanded:
-        turned, other = _rotations(values, "u_", euler, path)
-        if turned is None:
-            notes.append("no rotation of the set point in the map: taken as that of the start")
-            turned = Rotation.from_quat(np.tile(rotations[:1].as_quat(), (len(rotations), 1)))
-        elif other != kind:
-            notes.append(f"rotations are read from {kind}, those of the set point from {other}")
-    log = Log(
-        path,
-        values["time"],
-        _stack(values, ("x", "y", "z")),
-        rotations,
-        _stack(values, ("F_x", "F_y", "F_z")),
-        _stack(values, ("T_x", "T_y", "T_z")),
-        _stack(values, ("u_x", "u_y", "u_z")) if commanded else None,
-        turned,
-        frozenset(missing),
-        {name: columns[name][good] for name in keep},
-        tuple(notes),
-    )
-    return in_order(log)
-
-
-def in_order(log: Log) -> Log:
-    """The log with times from 0 and without repeated ones; `LogError` where time goes back."""
-    from dataclasses import replace
-
-    steps = np.diff(log.times)
-    if (steps < 0).any():
-        row = int(np.argmax(steps < 0)) + 1
-        raise LogError(
-            log.path,
-            f"time goes back from {log.times[row - 1]:.6g} to {log.times[row]:.6g} s at row {row}",
+            f"time goes back from {held[k]:.6g} to {held[k + 1]:.6g} s at"
+            f" {place(columns, int(timed[k + 1]))}{more}",
             "cut the recording there, or map the right column of times",
         )
-    fresh = np.concatenate(([True], steps > 0))
-    notes = list(log.notes)
-    if not fresh.all():
-        notes.append(f"{int((~fresh).sum())} samples repeat the time before and are left out")
-    log = log.only(fresh)
-    return replace(log, times=log.times - log.times[0], notes=tuple(notes))
 
 
 def _split(entry: str) -> tuple[str, str]:
@@ -213,40 +260,10 @@ def _find(column: str, columns: Columns, path: Path) -> None:
     if column in columns:
         return
     close = difflib.get_close_matches(column, list(columns), 1, 0.6)
-    names = ", ".join(list(columns)[:40])
-    remedy = f"did you mean {close[0]!r}?" if close else f"the columns are {names}"
+    remedy = f"did you mean {close[0]!r}?" if close else f"the columns are {_listed(columns)}"
     raise LogError(path, f"no column {column!r}", remedy)
 
 
-def _stack(values: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
-    zero = np.zeros(len(values["time"]))
-    return np.stack([values.get(name, zero) for name in names], axis=1)
-
-
-def _rotations(
-    values: Mapping[str, np.ndarray], prefix: str, euler: str, path: Path
-) -> tuple[Rotation | None, str]:
-    """The rotations that the map gives, and of which kind; None where it gives none."""
-    begun = {
-        kind: [prefix + name for name in names if prefix + name in values]
-        for kind, names in ROTATIONS.items()
-    }
-    kinds = [kind for kind, names in begun.items() if names]
-    if not kinds:
-        return None, ""
-    kind = kinds[0]
-    names = [prefix + name for name in ROTATIONS[kind]]
-    if len(kinds) > 1 or begun[kind] != names:
-        found = ", ".join(name for kind in kinds for name in begun[kind])
-        raise LogError(path, f"{found} in the map", f"expected all of {', '.join(names)} alone")
-    entries = np.stack([values[name] for name in names], axis=1)
-    try:
-        if kind == "rotation vector":
-            return Rotation.from_rotvec(entries), kind
-        if kind == "quaternion":
-            return Rotation.from_quat(entries), kind
-        if kind == "Euler angles":
-            return Rotation.from_euler(euler, entries), kind
-    except ValueError as error:
-        raise LogError(path, f"{kind} {', '.join(names)}: {error}", "check the map") from error
-    return Rotation.from_rotvec(entries * np.array([0.0, -1.0, 0.0])), kind
+def _listed(columns: Columns) -> str:
+    names = [f"{name!r}" if " " in name else name for name in columns]
+    return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")

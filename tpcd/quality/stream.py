@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+
+FEW = 4.0
+"""A spacing of so many usual ones is a gap."""
+LEAST_GAP = 0.05
+"""Shorter than this nothing is a gap [s]: an arm that is pulled by springs moves along a line."""
+NEAR = 50
+"""Spacings on either side that say what is usual."""
+ENOUGH = 5
+"""Fewer than this say nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,3 +31,52 @@ class Stream:
     """SI units; NaN where the recording has no number."""
     stamps: Float[np.ndarray, " k"] | None = None
     """The sender's own times [s], where they are another clock than `times`."""
+
+
+def role(stream: Stream) -> str:
+    """What a stream is: command, wrench or pose."""
+    if any(name.startswith("u_") for name in stream.channels):
+        return "command"
+    return "wrench" if any(name[:2] in ("F_", "T_") for name in stream.channels) else "pose"
+
+
+def read(stream: Stream) -> Bool[np.ndarray, " k"]:
+    """The samples whose channels all hold numbers."""
+    return np.isfinite(stream.values).all(1)
+
+
+def forward(times: Float[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+    """The samples that are later than all before them; what repeats a time or comes late is not."""
+    latest = np.maximum.accumulate(times)
+    return np.concatenate(([True], times[1:] > latest[:-1])) if len(times) else np.ones(0, bool)
+
+
+def find_gaps(times: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g 2"]:
+    """Last sample before every gap, and first one after it [s]; times must increase.
+
+    A gap is a spacing of several usual ones, where usual is what nine in ten of the spacings just
+    before or just after stay within: so neither a stream that changes its rate, nor one whose
+    samples come in bursts, is full of gaps.
+    """
+    spacings = np.diff(times)
+    wide = np.flatnonzero(spacings > LEAST_GAP)
+    if not len(wide):
+        return np.empty((0, 2))
+    before, after = _usual(spacings, wide, -NEAR), _usual(spacings, wide, 1)
+    usual = np.nan_to_num(np.fmax(before, after), nan=float(np.median(spacings)))
+    found = wide[spacings[wide] > np.maximum(LEAST_GAP, FEW * usual)]
+    return np.stack((times[found], times[found + 1]), axis=1)
+
+
+def _usual(
+    spacings: Float[np.ndarray, " k"], wide: Int[np.ndarray, " g"], begin: int
+) -> Float[np.ndarray, " g"]:
+    """What nine in ten of the `NEAR` spacings from `begin` after each stay within; NaN of few."""
+    padded = np.concatenate((np.full(NEAR, np.nan), spacings, np.full(NEAR + 1, np.nan)))
+    found = np.empty(len(wide))
+    for part in np.array_split(np.arange(len(wide)), len(wide) // 100_000 + 1):
+        near = np.sort(padded[wide[part, None] + NEAR + begin + np.arange(NEAR)], axis=1)
+        count = np.isfinite(near).sum(1)
+        place = (0.9 * np.maximum(count - 1, 0)).astype(np.int64)
+        found[part] = np.where(count >= ENOUGH, near[np.arange(len(part)), place], np.nan)
+    return found

@@ -1,0 +1,244 @@
+"""Streams of a recording brought to the times of its pose.
+
+A wrench is interpolated between two neighbouring samples that both hold numbers and are no gap
+apart; a set point holds until the next one comes. Samples are taken in the order in which they were
+recorded: what comes late or repeats a time is left out, nothing is sorted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tpcd.logs.log import Log, LogError
+from tpcd.quality.clocks import check_clocks
+from tpcd.quality.delay import estimate_delays
+from tpcd.quality.finding import Finding, Weight, overlapping
+from tpcd.quality.stream import Stream, find_gaps, forward, read, role
+
+ROTATIONS = {
+    "rotation vector": ("rx", "ry", "rz"),
+    "quaternion": ("qx", "qy", "qz", "qw"),
+    "Euler angles": ("e1", "e2", "e3"),
+    "planar angle": ("phi",),
+}
+NO_TURN = 1e-3
+"""A quaternion shorter than this is none: some senders fill with zeros."""
+DELAYS = ("pose", "wrench", "command")
+
+
+def parse_delays(entries: Sequence[str]) -> dict[str, float]:
+    """Delays [s] by stream from NAME=SECONDS, or {"auto": 0} ; raises `ValueError`."""
+    found: dict[str, float] = {}
+    for entry in entries:
+        name, _, text = entry.partition("=")
+        try:
+            found[name] = 0.0 if entry == "auto" else float(text)
+        except ValueError:
+            found = {}
+        if name not in (*DELAYS, "auto") or not np.isfinite(list(found.values()) or [np.nan]).all():
+            expected = "auto, pose=SECONDS, wrench=SECONDS or command=SECONDS"
+            raise ValueError(f"delay: found {entry!r}, expected {expected}")
+    return found
+
+
+def join(
+    path: Path,
+    streams: Sequence[Stream],
+    euler: str = "ZYX",
+    delays: Mapping[str, float] | None = None,
+    findings: Sequence[Finding] = (),
+    notes: Sequence[str] = (),
+    missing: frozenset[str] = frozenset(),
+    extra: Mapping[str, np.ndarray] | None = None,
+) -> Log:
+    """The recording at the times of its pose, where all streams have begun and none is in a gap.
+
+    Each stream is given earlier by its delay [s], or by what motion and force tell ("auto").
+    `findings` are in the times of the streams; `extra` columns go with the samples of the pose.
+    Raises `LogError` where the streams do not overlap, or rotations cannot be read.
+    """
+    parts = {role(stream): _turning(stream) for stream in streams}
+    parts, told = _moved(parts, dict(delays or {}))
+    pose, wrench, command = parts["pose"], parts["wrench"], parts.get("command")
+    _check_overlap(path, list(parts.values()))
+    fresh = forward(pose.times)
+    again = int((np.diff(pose.times) == 0).sum())
+    notes = [*notes]
+    if again:
+        notes.append(f"{again} samples repeat the time before and are left out")
+    if int((~fresh).sum()) > again:
+        notes.append(f"{int((~fresh).sum()) - again} samples come late and are left out")
+    at = pose.times[fresh]
+    values = {name: pose.values[fresh, k] for k, name in enumerate(pose.channels)}
+    held = [column for column in _interpolated(wrench, at, findings).T]
+    values.update(zip(wrench.channels, held, strict=True))
+    if command is not None:
+        values.update(zip(command.channels, _held(command, at).T, strict=True))
+    good = np.isfinite(np.stack(list(values.values()))).all(0)
+    if good.sum() < 2:
+        raise LogError(
+            path,
+            f"{int(good.sum())} of {len(at)} samples of the pose have all numbers",
+            "check the map or the topics, and what is missing",
+        )
+    values = {name: column[good] for name, column in values.items()}
+    zero = float(at[good][0])
+    moved = tuple(replace(part, times=part.times - zero) for part in parts.values())
+    found = [*(_earlier(each, zero) for each in (*findings, *told)), *check_clocks(moved)]
+    rotations, kind = _rotations(values, "", euler, path)
+    if rotations is None:
+        notes.append("no rotation in the map: taken as constant")
+        rotations, missing = Rotation.identity(int(good.sum())), missing | {"rotation"}
+    turned = None
+    if command is not None:
+        turned, other = _rotations(values, "u_", euler, path)
+        if turned is None:
+            notes.append("no rotation of the set point in the map: taken as that of the start")
+            turned = Rotation.from_quat(np.tile(rotations[:1].as_quat(), (len(rotations), 1)))
+        elif other != kind:
+            notes.append(f"rotations are read from {kind}, those of the set point from {other}")
+    if "tau" in values:
+        # phi turns from x to z, about -y.
+        values["T_y"] = -values["tau"]
+    return Log(
+        path,
+        at[good] - zero,
+        _stack(values, ("x", "y", "z")),
+        rotations,
+        _stack(values, ("F_x", "F_y", "F_z")),
+        _stack(values, ("T_x", "T_y", "T_z")),
+        None if command is None else _stack(values, ("u_x", "u_y", "u_z")),
+        turned,
+        missing,
+        {name: column[fresh][good] for name, column in (extra or {}).items()},
+        tuple(notes),
+        moved,
+        tuple(found),
+    )
+
+
+def _turning(stream: Stream) -> Stream:
+    """The stream without its quaternions of length 0, which are no rotation."""
+    names = [name.removeprefix("u_") for name in stream.channels]
+    places = [names.index(name) for name in ROTATIONS["quaternion"] if name in names]
+    if len(places) < 4:
+        return stream
+    none = np.linalg.norm(stream.values[:, places], axis=1) < NO_TURN
+    if not none.any():
+        return stream
+    return replace(stream, values=np.where(none[:, None], np.nan, stream.values))
+
+
+def _moved(
+    parts: dict[str, Stream], delays: dict[str, float]
+) -> tuple[dict[str, Stream], list[Finding]]:
+    """The streams without their delays, and what was done."""
+    if delays.pop("auto", None) is not None:
+        known = estimate_delays(list(parts.values()))
+        delays = {each.of: each.value for each in known if each.doubtful} | delays
+    told = []
+    for name, delay in delays.items():
+        if name in parts:
+            part = parts[name]
+            parts = {**parts, name: replace(part, times=part.times - delay)}
+            sentence = f"{part.name}: the {name} is taken {delay:.3g} s earlier than it is recorded"
+            told.append(Finding("moved", Weight.NOTE, sentence, part.channels))
+    return parts, told
+
+
+def _check_overlap(path: Path, parts: Sequence[Stream]) -> None:
+    for part in parts:
+        if not read(part).any():
+            channels = ", ".join(
+                name
+                for k, name in enumerate(part.channels)
+                if not np.isfinite(part.values[:, k]).any()
+            )
+            raise LogError(
+                path,
+                f"{part.name} has no sample with all of {', '.join(part.channels)}"
+                + (f" ({channels} hold no number at all)" if channels else ""),
+                "check the map of columns",
+            )
+    spans = {p.name: p.times[read(p)] for p in parts}
+    begin = max(times[0] for times in spans.values())
+    end = min(times[-1] for p in parts if role(p) != "command" for times in (spans[p.name],))
+    if begin > end:
+        told = "; ".join(f"{name} {t[0]:.2f} to {t[-1]:.2f} s" for name, t in spans.items())
+        raise LogError(path, f"the streams do not overlap in time ({told})", "check the clocks")
+
+
+def _interpolated(
+    stream: Stream, times: Float[np.ndarray, " n"], findings: Sequence[Finding]
+) -> Float[np.ndarray, "n w"]:
+    """Values at some times; NaN where the samples around hold none, or are a gap apart."""
+    fresh = forward(stream.times)
+    own, values = stream.times[fresh], stream.values[fresh]
+    after = np.clip(np.searchsorted(own, times), 0, len(own) - 1)
+    # A sample at the very time stands alone.
+    before = np.where(own[after] == times, after, np.maximum(after - 1, 0))
+    width = own[after] - own[before]
+    share = np.divide(times - own[before], width, out=np.zeros(len(times)), where=width > 0)
+    found = values[before] + share[:, None] * (values[after] - values[before])
+    found[(times < own[0]) | (times > own[-1])] = np.nan
+    numbers = own[np.isfinite(values).all(1)]
+    cuts = [(each.start, each.end) for each in findings if overlapping(-np.inf, np.inf, [each])]
+    for start, end in [*find_gaps(numbers).tolist(), *cuts]:
+        found[(times > start) & (times < end)] = np.nan
+    return found
+
+
+def _held(stream: Stream, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n w"]:
+    """The last values at some times; NaN before the first."""
+    fresh = forward(stream.times)
+    last = np.searchsorted(stream.times[fresh], times, side="right") - 1
+    return np.where(last[:, None] < 0, np.nan, stream.values[fresh][np.maximum(last, 0)])
+
+
+def _earlier(finding: Finding, by: float) -> Finding:
+    start, end = finding.start, finding.end
+    return replace(
+        finding,
+        start=None if start is None else start - by,
+        end=None if end is None else end - by,
+    )
+
+
+def _stack(values: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    zero = np.zeros(len(next(iter(values.values()))))
+    return np.stack([values.get(name, zero) for name in names], axis=1)
+
+
+def _rotations(
+    values: Mapping[str, np.ndarray], prefix: str, euler: str, path: Path
+) -> tuple[Rotation | None, str]:
+    """The rotations that the map gives, and of which kind; None where it gives none."""
+    begun = {
+        kind: [prefix + name for name in names if prefix + name in values]
+        for kind, names in ROTATIONS.items()
+    }
+    kinds = [kind for kind, names in begun.items() if names]
+    if not kinds:
+        return None, ""
+    kind = kinds[0]
+    names = [prefix + name for name in ROTATIONS[kind]]
+    if len(kinds) > 1 or begun[kind] != names:
+        found = ", ".join(name for kind in kinds for name in begun[kind])
+        raise LogError(path, f"{found} in the map", f"expected all of {', '.join(names)} alone")
+    entries = np.stack([values[name] for name in names], axis=1)
+    try:
+        if kind == "rotation vector":
+            return Rotation.from_rotvec(entries), kind
+        if kind == "quaternion":
+            return Rotation.from_quat(entries), kind
+        if kind == "Euler angles":
+            return Rotation.from_euler(euler, entries), kind
+    except ValueError as error:
+        raise LogError(path, f"{kind} {', '.join(names)}: {error}", "check the map") from error
+    return Rotation.from_rotvec(entries * np.array([0.0, -1.0, 0.0])), kind

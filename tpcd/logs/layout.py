@@ -1,0 +1,187 @@
+"""How a text table is laid out: encoding, separator, line of names, line of units, decimal mark.
+
+Loggers put remarks above the names, units below them, separators at the ends of lines, blanks and
+commas into names. What the lines of numbers agree on decides: the separator is the one that cuts
+most of them into equally many numbers, outside of quotes; the names stand in the last line above
+them that has as many cells.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+SEPARATORS = (",", ";", "\t", "|", " ")
+NULLS = ("", "-", "--", "?", "na", "n/a", "#n/a", "nan", "-nan", "null", "none", "nil", "1.#ind",
+         "-1.#ind", "1.#qnan")  # fmt: skip
+"""Cells, in small letters, that say that there is no number."""
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.IGNORECASE)
+COMMA_NUMBER = re.compile(r"[+-]?(\d+(,\d+)?|,\d+)([eE][+-]?\d+)?")
+REMARK = re.compile(r"^\s*(#|%|//|\*)+\s*")
+SAMPLE = 400
+"""So many lines from the beginning show the layout."""
+_UNITS = {
+    "s": "s sec secs second seconds",
+    "ms": "ms msec millisecond milliseconds",
+    "us": "us µs μs usec microsecond microseconds",
+    "ns": "ns nsec nanosecond nanoseconds",
+    "m": "m meter meters metre metres",
+    "cm": "cm",
+    "mm": "mm millimeter millimeters",
+    "um": "um µm μm",
+    "in": "in inch inches",
+    "rad": "rad rads radian radians",
+    "mrad": "mrad",
+    "deg": "deg degs degree degrees °",
+    "N": "n newton newtons",
+    "mN": "",
+    "kN": "kn",
+    "Nm": "nm n*m n·m n.m n_m n-m",
+    "mNm": "mnm",
+    "Nmm": "nmm n*mm n·mm",
+    "Ncm": "ncm n*cm n·cm",
+    "1": "1 - none",
+}
+_SPELLED = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where names and numbers stand in a text table."""
+
+    separator: str
+    names: tuple[str, ...]
+    first: int
+    """Index of the first line of numbers, from 0."""
+    comma: bool = False
+    """Whether the decimal mark is a comma."""
+    units: tuple[str, ...] = ()
+    """Units by the line below the names, "" where they are not known."""
+    notes: tuple[str, ...] = ()
+
+
+def unit_word(text: str) -> str:
+    """A unit as the map of columns spells it, from `[mm]`, `(N*m)`, `sec`; "" if it is none."""
+    bare = text.strip().strip("[](){}").replace(" ", "")
+    exact = bare if bare in _UNITS else ""
+    return exact or _SPELLED.get(bare.lower(), "")
+
+
+def unit_of_name(name: str) -> str:
+    """The unit in the brackets at the end of a column's name, or ""."""
+    found = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", name)
+    unit = unit_word(found.group(1)) if found else ""
+    return "" if unit == "1" else unit
+
+
+def is_null(cell: str) -> bool:
+    """Whether a cell says that there is no number."""
+    return cell.strip().lower() in NULLS
+
+
+def split(line: str, separator: str) -> list[str]:
+    """Cells of a line, with their quotes and outer blanks off."""
+    if separator == " ":
+        line = " ".join(line.split())
+    cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    return [cell.strip() for cell in cells]
+
+
+def find_layout(lines: Sequence[str], more: Sequence[str] = ()) -> Layout:
+    """The layout of a table from its first lines, and `more` from further on.
+
+    Raises `ValueError` where there are no names, or as many as fit no line of numbers.
+    """
+    shown = list(lines[:SAMPLE])
+    if not any(line.strip() for line in shown):
+        raise ValueError("the file is empty")
+    separator, count = _separator([*shown, *more])
+    cells = [split(line, separator) for line in shown]
+    rows = [k for k, row in enumerate(cells) if _is_row(row, count, separator)]
+    above = [k for k, line in enumerate(shown) if line.strip()]
+    if not rows:
+        # Nothing but names, or nothing that is a table.
+        return Layout(separator, tuple(split(REMARK.sub("", shown[above[-1]]), separator)),
+                      above[-1] + 1)  # fmt: skip
+    first = rows[0]
+    above = [k for k in above if k < first]
+    if not above:
+        raise ValueError(f"line {first + 1} holds numbers, and no line above it holds names")
+    headers = {k: named for k in above if (named := _names(shown[k], separator, count))}
+    if not headers:
+        found = len(split(REMARK.sub("", shown[above[-1]]), separator))
+        raise ValueError(f"line {above[-1] + 1} has {found} names, the rows below it have {count}")
+    *before, last = headers
+    names, units, notes = headers[last], (), ()
+    if before and before[-1] == last - 1 and _below_names(names):
+        units = tuple(unit_word(cell) for cell in names)
+        if not all(units[k] or not cell for k, cell in enumerate(names)):
+            odd = next(cell for k, cell in enumerate(names) if cell and not units[k])
+            notes = (f"line {last + 1} is no line of names, and {odd!r} in it is no known unit",)
+        names = headers[before[-1]]
+    table = [row for row in [*cells[first:], *(split(line, separator) for line in more)]]
+    numbers = [cell for row in table for cell in row if cell]
+    commas = sum("," in cell and COMMA_NUMBER.fullmatch(cell) is not None for cell in numbers)
+    points = sum("." in cell and NUMBER.fullmatch(cell) is not None for cell in numbers)
+    return Layout(separator, names, first, separator != "," and commas > points, units, notes)
+
+
+def is_number(cell: str, separator: str = ";") -> bool:
+    """Whether a cell is a number, with a decimal comma where that is no separator."""
+    if NUMBER.fullmatch(cell):
+        return True
+    return separator != "," and COMMA_NUMBER.fullmatch(cell) is not None
+
+
+def _separator(lines: Sequence[str]) -> tuple[str, int]:
+    """The separator that cuts most lines into equally many numbers, and how many cells."""
+    best, chosen = (-1.0, 0), (",", 1)
+    for separator in SEPARATORS:
+        rows = [split(line, separator) for line in lines if line.strip()]
+        counts = Counter(len(row) for row in rows if any(is_number(c, separator) for c in row))
+        counts = counts or Counter(len(row) for row in rows)
+        count, _ = counts.most_common(1)[0]
+        if count < 2:
+            continue
+        fitting = [row for row in rows if len(row) == count]
+        full = sum(sum(1 for cell in row if cell) for row in fitting)
+        numbers = sum(is_number(cell, separator) for row in fitting for cell in row)
+        score = (numbers / max(full, 1) * len(fitting) / len(rows), count)
+        if score > best:
+            best, chosen = score, (separator, count)
+    return chosen
+
+
+def _is_row(row: list[str], count: int, separator: str) -> bool:
+    """Whether most of a line's cells are numbers, or say that there is none."""
+    numbers = sum(is_number(cell, separator) for cell in row)
+    full = sum(not is_null(cell) for cell in row)
+    return len(row) == count and numbers > 0 and 2 * numbers >= full
+
+
+def _names(line: str, separator: str, count: int) -> tuple[str, ...]:
+    """Names in a line, as many as there are columns; none where it has fewer or more.
+
+    The lines of numbers may end in a separator where that of the names does not, and the reverse;
+    names may be parted otherwise, as by a blank after each comma.
+    """
+    bare = REMARK.sub("", line)
+    for mark in (separator, *SEPARATORS):
+        cells = split(bare, mark)
+        if len(cells) == count + 1 and not cells[-1]:
+            cells = cells[:-1]
+        if len(cells) == count - 1 and line.strip() and mark == separator and count > 2:
+            cells = [*cells, ""]
+        if len(cells) == count and any(cells):
+            return tuple(cells)
+    return ()
+
+
+def _below_names(cells: Sequence[str]) -> bool:
+    """Whether cells are units, or cannot be names since they repeat."""
+    full = [cell for cell in cells if cell]
+    known = sum(bool(unit_word(cell)) for cell in full)
+    return 2 * known >= len(full) or len(set(full)) < len(full)

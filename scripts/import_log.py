@@ -41,7 +41,7 @@ class LogImport:
     euler: str = "ZYX"
     """Axes of Euler angles e1 e2 e3; capitals for axes that turn along."""
     delay: tuple[str, ...] = ()
-    """How late a stream is, as wrench=SECONDS, command=SECONDS or pose=SECONDS, to be taken earlier;
+    """How late a stream is, as wrench=SECONDS, command=SECONDS or pose=SECONDS, to be taken off;
     or auto, as motion and force tell."""
     rate: float | None = None
     """Samples a second [Hz], for tables without times."""

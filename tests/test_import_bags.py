@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from made_bags import BEGIN, FRAMES, KINDS, TOPICS, write_bag
 from made_logs import Setting, an_episode, choices_of, in_space, sampled
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
 
 from tpcd.data.episode import Episode
 from tpcd.logs.bags import POSE, WRENCH, choose_topics, is_bag, read_bag
@@ -22,91 +17,6 @@ from tpcd.logs.log import LogError
 
 EPISODE = an_episode(4)
 SPACE = in_space(sampled(EPISODE), Setting())
-TOPICS = {"pose": "/tcp_pose", "wrench": "/ft_sensor", "command": "/target_pose"}
-FRAMES = {"pose": "base", "wrench": "base", "command": "base"}
-BEGIN = 1_700_000_000.0
-
-
-def messages(store: Any, frames: dict[str, str], stamped: bool) -> dict[str, list[tuple[int, Any]]]:
-    """Time [ns] and message of every topic; the wrench comes 3 ms later, commands at 20 Hz."""
-    types = store.types
-    ros1 = "seq" in types["std_msgs/msg/Header"].__dataclass_fields__
-
-    def header(time: float, role: str) -> Any:
-        whole = int(time) if stamped else 0
-        nanoseconds = round(1e9 * (time - int(time))) if stamped else 0
-        stamp = types["builtin_interfaces/msg/Time"](sec=whole, nanosec=nanoseconds)
-        more = {"seq": 0} if ros1 else {}
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frames[role], **more)
-
-    def pose(time: float, role: str, position: np.ndarray, rotation: np.ndarray) -> Any:
-        x, y, z, w = rotation.tolist()
-        return types[POSE](
-            header=header(time, role),
-            pose=types["geometry_msgs/msg/Pose"](
-                position=types["geometry_msgs/msg/Point"](*position.tolist()),
-                orientation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
-            ),
-        )
-
-    def wrench(time: float, k: int) -> Any:
-        vector = types["geometry_msgs/msg/Vector3"]
-        return types[WRENCH](
-            header=header(time, "wrench"),
-            wrench=types["geometry_msgs/msg/Wrench"](
-                force=vector(*SPACE["force"][k].tolist()),
-                torque=vector(*SPACE["torque"][k].tolist()),
-            ),
-        )
-
-    written: dict[str, list[tuple[int, Any]]] = {role: [] for role in TOPICS}
-    for k, since in enumerate(SPACE["time"]):
-        time = BEGIN + since
-        nanoseconds = round(1e9 * time)
-        written["pose"].append(
-            (nanoseconds, pose(time, "pose", SPACE["position"][k], SPACE["rotation"][k]))
-        )
-        written["wrench"].append((nanoseconds + 3_000_000, wrench(time + 0.003, k)))
-        if k % 5 == 0:
-            written["command"].append(
-                (nanoseconds, pose(time, "command", SPACE["target"][k], SPACE["turned"][k]))
-            )
-    return written
-
-
-def write_ros1(path: Path, topics: dict[str, str], frames: dict[str, str], stamped: bool) -> Path:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    path = path.with_suffix(".bag")
-    with Writer1(path) as writer:
-        for role, written in messages(store, frames, stamped).items():
-            if role in topics:
-                kind = WRENCH if role == "wrench" else POSE
-                connection = writer.add_connection(topics[role], kind, typestore=store)
-                for time, message in written:
-                    writer.write(connection, time, bytes(store.serialize_ros1(message, kind)))
-    return path
-
-
-def write_ros2(plugin: StoragePlugin) -> Callable[..., Path]:
-    def write(path: Path, topics: dict[str, str], frames: dict[str, str], stamped: bool) -> Path:
-        store = get_typestore(Stores.ROS2_HUMBLE)
-        with Writer2(path, version=9, storage_plugin=plugin) as writer:
-            for role, written in messages(store, frames, stamped).items():
-                if role in topics:
-                    kind = WRENCH if role == "wrench" else POSE
-                    connection = writer.add_connection(topics[role], kind, typestore=store)
-                    for time, message in written:
-                        writer.write(connection, time, bytes(store.serialize_cdr(message, kind)))
-        return path
-
-    return write
-
-
-WRITERS = {
-    "ros1": write_ros1,
-    "ros2": write_ros2(StoragePlugin.SQLITE3),
-    "mcap": write_ros2(StoragePlugin.MCAP),
-}
 
 
 def check(path: Path) -> None:
@@ -123,32 +33,33 @@ def check(path: Path) -> None:
     assert np.allclose(found, expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("stamped", [True, False], ids=["stamps", "recorder"])
 def test_bags_of_every_kind_are_the_episode(kind: str, stamped: bool, tmp_path: Path) -> None:
-    path = WRITERS[kind](tmp_path / "run", TOPICS, FRAMES, stamped)
+    stamp = BEGIN if stamped else None
+    path = write_bag(kind, tmp_path / "run", SPACE, stamp=lambda role, time: stamp and stamp + time)
     assert is_bag(path)
     check(path)
 
 
 @pytest.mark.parametrize(("kind", "pattern"), [("ros2", "*.db3"), ("mcap", "*.mcap")])
 def test_the_file_inside_a_bag_is_enough(kind: str, pattern: str, tmp_path: Path) -> None:
-    path = WRITERS[kind](tmp_path / "run", TOPICS, FRAMES, True)
+    path = write_bag(kind, tmp_path / "run", SPACE)
     (inside,) = path.glob(pattern)
     check(inside)
 
 
 def test_frames_that_differ_are_told_or_refused(tmp_path: Path) -> None:
-    path = write_ros1(tmp_path / "a", TOPICS, {**FRAMES, "wrench": "tool0"}, True)
+    path = write_bag("ros1", tmp_path / "a", SPACE, frames={**FRAMES, "wrench": "tool0"})
     assert any("give --wrench_frame tool" in note for note in read_bag(path).notes)
-    path = write_ros1(tmp_path / "b", TOPICS, {**FRAMES, "command": "world"}, True)
+    path = write_bag("ros1", tmp_path / "b", SPACE, frames={**FRAMES, "command": "world"})
     with pytest.raises(LogError, match="the pose is in 'base', the set point in 'world'"):
         read_bag(path)
 
 
 def test_a_bag_without_set_points_says_so_later(tmp_path: Path) -> None:
     topics = {role: topic for role, topic in TOPICS.items() if role != "command"}
-    log = read_bag(write_ros1(tmp_path / "a", topics, FRAMES, True))
+    log = read_bag(write_bag("ros1", tmp_path / "a", SPACE, topics))
     assert log.command_positions is None
 
 

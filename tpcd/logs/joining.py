@@ -63,13 +63,14 @@ def join(
     `findings` are in the times of the streams; `extra` columns go with the samples of the pose.
     Raises `LogError` where the streams do not overlap, or rotations cannot be read.
     """
-    parts = {role(stream): _turning(stream) for stream in streams}
+    turns = [_turning(stream) for stream in streams]
+    notes = [*notes, *(note for _, note in turns if note)]
+    parts = {role(stream): stream for stream, _ in turns}
     parts, told = _moved(parts, dict(delays or {}))
     pose, wrench, command = parts["pose"], parts["wrench"], parts.get("command")
     _check_overlap(path, list(parts.values()))
     fresh = forward(pose.times)
     again = int((np.diff(pose.times) == 0).sum())
-    notes = [*notes]
     if again:
         notes.append(f"{again} samples repeat the time before and are left out")
     if int((~fresh).sum()) > again:
@@ -90,7 +91,12 @@ def join(
     values = {name: column[good] for name, column in values.items()}
     zero = float(at[good][0])
     moved = tuple(replace(part, times=part.times - zero) for part in parts.values())
-    found = [*(_earlier(each, zero) for each in (*findings, *told)), *check_clocks(moved)]
+    given = [_earlier(each, zero) for each in (*findings, *told)]
+    found = []
+    for each in check_clocks(moved):
+        # Where pieces were put together no samples can be, and that is told.
+        seam = overlapping(each.start or 0.0, each.end or 0.0, given)
+        found += [] if each.kind == "gap" and seam else [each]
     rotations, kind = _rotations(values, "", euler, path)
     if rotations is None:
         notes.append("no rotation in the map: taken as constant")
@@ -119,20 +125,24 @@ def join(
         {name: column[fresh][good] for name, column in (extra or {}).items()},
         tuple(notes),
         moved,
-        tuple(found),
+        (*given, *found),
     )
 
 
-def _turning(stream: Stream) -> Stream:
-    """The stream without its quaternions of length 0, which are no rotation."""
+def _turning(stream: Stream) -> tuple[Stream, str]:
+    """The stream without its quaternions of length 0, which are no rotation, and what is told."""
     names = [name.removeprefix("u_") for name in stream.channels]
     places = [names.index(name) for name in ROTATIONS["quaternion"] if name in names]
     if len(places) < 4:
-        return stream
+        return stream, ""
     none = np.linalg.norm(stream.values[:, places], axis=1) < NO_TURN
     if not none.any():
-        return stream
-    return replace(stream, values=np.where(none[:, None], np.nan, stream.values))
+        return stream, ""
+    note = (
+        f"{int(none.sum())} samples of {stream.name} have a quaternion of length 0, which is no"
+        f" rotation, and are left out (the first is number {int(np.argmax(none)) + 1})"
+    )
+    return replace(stream, values=np.where(none[:, None], np.nan, stream.values)), note
 
 
 def _moved(

@@ -189,8 +189,9 @@ def _pieces(
     for k in range(1, len(edges) + 1):
         ends = [j[p < k].max() for j, p in zip(joined, piece, strict=True) if (p < k).any()]
         begins = [c[p == k].min() for c, p in zip(clock, piece, strict=True) if (p == k).any()]
-        size = float(np.diff(clock[most])[cuts[most][k - 1] - 1])
+        before = shift
         shift = max(ends) + SEAM - min(begins)
+        size = before + SEAM - shift
         for j, c, p in zip(joined, clock, piece, strict=True):
             j[p >= k] = c[p >= k] + shift
         sentence = (

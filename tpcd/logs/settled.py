@@ -72,9 +72,9 @@ def find_settled(log: PlanarLog, stillness: Stillness) -> Settled:
     """
     if log.commands is None:
         stretches = _windows(log.times, stillness.window)
-        whole = np.array([_whole(log, int(a), int(b)) for a, b in stretches], dtype=bool)
-        broken = tuple(log.times[stretches[~whole, 1] - 1].tolist())
-        return _rows(log, stretches[whole], None, (), 0, broken)
+        ends = log.times[stretches[:, 1] - 1]
+        whole = np.array([_whole(log, float(end), stillness) for end in ends], dtype=bool)
+        return _rows(log, stretches[whole], None, (), 0, tuple(ends[~whole].tolist()))
     holds = find_holds(log.commands)
     ends = log.times[holds[:, 1] - 1]
     long = ends - log.times[holds[:, 0]] >= stillness.window
@@ -82,7 +82,7 @@ def find_settled(log: PlanarLog, stillness: Stillness) -> Settled:
     stretches, unsettled, broken = [], [], []
     for (_, end), time in zip(holds[long], ends[long], strict=True):
         first = int(np.searchsorted(log.times, time - stillness.window))
-        if not _whole(log, first, int(end)):
+        if not _whole(log, float(time), stillness):
             broken.append(float(time))
         elif end - first < 2 * BLOCKS:
             brief += 1
@@ -113,9 +113,9 @@ def _windows(times: Float[np.ndarray, " n"], window: float) -> Int[np.ndarray, "
     return pairs[pairs[:, 1] - pairs[:, 0] >= 2 * BLOCKS].astype(np.int64)
 
 
-def _whole(log: PlanarLog, first: int, end: int) -> bool:
-    """Whether no finding leaves out any of the time from one sample to another."""
-    return not overlapping(float(log.times[first]), float(log.times[end - 1]), log.findings)
+def _whole(log: PlanarLog, end: float, stillness: Stillness) -> bool:
+    """Whether no finding leaves out any of the window that ends at some time."""
+    return not overlapping(end - stillness.window, end, log.findings)
 
 
 def _still(log: PlanarLog, first: int, end: int, stillness: Stillness) -> bool:

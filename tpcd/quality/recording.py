@@ -1,0 +1,20 @@
+"""Everything that is checked on a recording before it is believed, in one call.
+
+Readers attach what it finds to `Log.findings`; `scripts/check.py` shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tpcd.quality.channels import check_channels
+from tpcd.quality.finding import Finding
+from tpcd.quality.stream import Stream
+
+
+def check_recording(streams: Sequence[Stream]) -> tuple[Finding, ...]:
+    """All findings of the streams of one recording, in SI units, as they were recorded.
+
+    Their times are [s since the first sample] of the earliest stream.
+    """
+    return (*check_channels(streams),)

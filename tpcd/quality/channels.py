@@ -91,10 +91,11 @@ def _stretches(channel: Channel, group: Sequence[str]) -> Iterator[tuple[str, Ch
     if group == WRENCH:
         clipped = clipped_stretches(channel.values, channel.habit)
     yield from (("clipped", channel, each) for each in clipped)
-    ends = {each.value for each in clipped}
+    told = {each.value for each in clipped}
+    ends = {float(channel.values.min()), float(channel.values.max())} if group == WRENCH else set()
     for each in frozen_stretches(channel.values, channel.habit, others):
-        if each.value not in ends:
-            yield "frozen", channel, each
+        if each.value not in told:
+            yield "clipped" if each.value in ends else "frozen", channel, each
 
 
 def _still(channel: Channel) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""How one channel of a recording usually behaves: what is repeated, in which steps, with what noise.
+"""How one channel of a recording usually behaves: what is repeated, in which steps, what noise.
 
 A sensor that works gives another number with every new sample, since its noise never rests; one
 that repeats a number for much longer than that is frozen. What "much longer" is depends on the

@@ -43,10 +43,7 @@ def frozen_stretches(
     `others` are channels of the same sensor. Without noise of its own, a channel is frozen only
     where it comes back with a jump after others changed.
     """
-    if habit.lively:
-        chosen = habit.long
-    else:
-        chosen = _came_back(values, habit, others)
+    chosen = habit.long if habit.lively else _came_back(values, habit, others)
     return tuple(
         Stretch(int(first), int(first + length), float(values[first]))
         for first, length in zip(habit.starts[chosen], habit.lengths[chosen], strict=True)

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tpcd.quality.finding import Finding, Weight
-from tpcd.quality.habit import Habit, find_habit
+from tpcd.quality.habit import COARSEST, Habit, find_habit, grid_step
+from tpcd.quality.spikes import find_spikes
 from tpcd.quality.stream import Stream
 from tpcd.quality.stretches import Stretch, clipped_stretches, frozen_stretches
 
@@ -60,10 +61,10 @@ def channels_of(streams: Sequence[Stream], names: Sequence[str]) -> Iterator[Cha
             found = stream.values[:, columns]
             samples = np.flatnonzero(np.isfinite(found).all(1))
             if len(samples):
-                values = found[samples, 0]
-                if len(columns) > 1:
-                    values = found[samples] @ MIXED[: len(columns)]
-                yield Channel(name, stream, samples, values, find_habit(values))
+                weights = MIXED[: len(columns)] if len(columns) > 1 else np.ones(1)
+                values = found[samples] @ weights
+                step = sum(w * grid_step(v) for w, v in zip(weights, found[samples].T, strict=True))
+                yield Channel(name, stream, samples, values, find_habit(values, float(step)))
 
 
 def check_channels(streams: Sequence[Stream]) -> tuple[Finding, ...]:
@@ -74,7 +75,7 @@ def check_channels(streams: Sequence[Stream]) -> tuple[Finding, ...]:
             channels = list(channels_of([stream], group))
             stretches: list[tuple[str, Channel, Stretch]] = []
             for channel in channels:
-                found += _still(channel)
+                found += _manner(channel)
                 stretches += _stretches(channel, group)
             found += _told(stretches)
     return tuple(found)
@@ -96,19 +97,26 @@ def _stretches(channel: Channel, group: Sequence[str]) -> Iterator[tuple[str, Ch
     for each in frozen_stretches(channel.values, channel.habit, others):
         if each.value not in told:
             yield "clipped" if each.value in ends else "frozen", channel, each
+    for place in find_spikes(channel.values, channel.habit.step):
+        yield "spike", channel, Stretch(int(place), int(place) + 1, float(channel.values[place]))
 
 
-def _still(channel: Channel) -> Iterator[Finding]:
-    """A channel that never changes was not recorded, or measures nothing."""
-    if len(channel.values) > 1 and len(channel.habit.starts) == 1:
+def _manner(channel: Channel) -> Iterator[Finding]:
+    """How a channel is recorded, where that hides something: never changing, seldom updated, or in
+    steps larger than its noise."""
+    habit, count = channel.habit, len(channel.values)
+    if count > 1 and len(habit.starts) == 1:
         value = "" if channel.name == "rotation" else f" at {channel.values[0]:.6g}"
-        yield Finding(
-            "constant",
-            Weight.NOTE,
-            f"{channel.name} stays{value} in all {len(channel.values)} samples: not recorded,"
-            " or nothing moves it",
-            (channel.name,),
-        )
+        told = f"{channel.name} stays{value} in all {count} samples: not recorded, or nothing"
+        yield Finding("constant", Weight.NOTE, f"{told} moves it", (channel.name,))
+        return
+    if habit.hold > 1 and np.quantile(habit.lengths, 0.9) <= 2 * habit.hold:
+        told = f"{channel.name} is updated with every {habit.hold}th sample only"
+        yield Finding("slow", Weight.NOTE, told, (channel.name,))
+    if habit.step > COARSEST * habit.noise and channel.name != "rotation" and not habit.lively:
+        told = f"{channel.name} comes in steps of {habit.step:.3g}, which hide its noise"
+        remedy = "whether it ever froze or was clipped cannot be told"
+        yield Finding("coarse", Weight.NOTE, told, (channel.name,), remedy=remedy)
 
 
 def _told(stretches: list[tuple[str, Channel, Stretch]]) -> Iterator[Finding]:
@@ -131,16 +139,22 @@ def _finding(kind: str, channel: Channel, names: list[str], stretch: Stretch) ->
     times, count = channel.times, stretch.end - stretch.first
     start, end = float(times[stretch.first]), float(times[stretch.end - 1])
     rows = int(channel.samples[stretch.first]), int(channel.samples[stretch.end - 1]) + 1
-    who = ", ".join(names)
+    who, alone = ", ".join(names), len(names) == 1 and names[0] != "rotation"
     during = f"from {start:.4g} to {end:.4g} s ({count} samples, rows {rows[0]} to {rows[1] - 1})"
-    if kind == "frozen":
-        value = f"at {stretch.value:.6g} " if names[0] != "rotation" and len(names) == 1 else ""
-        usual = f"at most {channel.habit.longest:.0f}" if channel.habit.lively else "a change"
-        told = f"{who}: frozen {value}{during}, expected {usual} samples with one value"
-        if not channel.habit.lively:
-            told = f"{who}: frozen {value}{during}, then it jumps, while others moved"
-        remedy = "left out; look at the sensor's connection and driver"
-    else:
-        told = f"{who}: at the end of its range, {stretch.value:.6g}, {during}"
+    remedy = "left out; look at the sensor's connection and driver"
+    if kind == "spike":
+        size = stretch.value - channel.values[stretch.first - 1]
+        what = f"a spike of {size:.4g}" if alone else "a spike"
+        told = f"{who}: {what} at {start:.4g} s (row {rows[0]})"
+    elif kind == "clipped":
+        told = (
+            f"{who}: at the end of its range{f', {stretch.value:.6g},' if alone else ''} {during}"
+        )
         remedy = "left out; press less, or use a sensor with a larger range"
+    else:
+        told = f"{who}: frozen {f'at {stretch.value:.6g} ' if alone else ''}{during}"
+        if channel.habit.lively:
+            told += f", expected at most {channel.habit.longest:.0f} samples with one value"
+        else:
+            told += ", then it jumps, while others moved"
     return Finding(kind, Weight.LEFT_OUT, told, tuple(names), start, end, rows, remedy)

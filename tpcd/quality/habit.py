@@ -28,6 +28,8 @@ LEAST_TURNS = 0.1
 """Noise turns back and forth: white noise in 2 of 3 changes; an arm that settles hardly ever."""
 LEAST_FLOOR = 0.1
 """Noise is steady: its quietest moments have this part of the usual ones; settling has none."""
+ENOUGH = 100_000
+"""Samples that show the steps of a reading."""
 COARSEST = 3.0
 """Steps of a reading that are larger than this many standard deviations hide its noise."""
 
@@ -57,20 +59,23 @@ class Habit:
         return self.lengths >= self.longest
 
 
-def find_habit(values: Float[np.ndarray, " n"]) -> Habit:
-    """The habit of finite samples in order of recording, of which there is at least one."""
+def find_habit(values: Float[np.ndarray, " n"], step: float | None = None) -> Habit:
+    """The habit of finite samples in order of recording, of which there is at least one.
+
+    `step` is that between readings, None to find it.
+    """
+    step = grid_step(values) if step is None else step
     starts = np.concatenate(([0], np.flatnonzero(np.diff(values) != 0) + 1))
     lengths = np.diff(np.append(starts, len(values)))
     hold = max(1, round(float(np.median(lengths))))
     if len(starts) < 4:
-        return Habit(starts, lengths, hold, 0.0, 0.0, False, math.inf)
+        return Habit(starts, lengths, hold, step, 0.0, False, math.inf)
     typical = _typical_length(lengths)
     longest = FEWEST * hold
     if typical > 1.5 * hold:
         longest = max(longest, LONGER * typical)
     usual = lengths < longest
     noise, lively = _noise(values, hold, np.repeat(usual, lengths))
-    step = _step(values[starts])
     repeated = 1.0 - usual.sum() / max(1.0, lengths[usual].sum() / hold)
     surprise = -math.log(FALSE_ALARM / len(values))
     for again in (repeated, _middle(step, noise)):
@@ -116,9 +121,9 @@ def _turns(parts: Float[np.ndarray, "b q"]) -> float:
     return float((directions[1:] * directions[:-1] < 0).mean()) if len(directions) > 1 else 0.0
 
 
-def _step(values: Float[np.ndarray, " r"]) -> float:
+def grid_step(values: Float[np.ndarray, " n"]) -> float:
     """The step between readings where all are whole multiples of it; else 0."""
-    levels = np.unique(values)
+    levels = np.unique(values[:: max(1, len(values) // ENOUGH)])
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * max(1e-300, float(np.abs(levels).max()))]
     if not len(gaps):

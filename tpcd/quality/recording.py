@@ -9,7 +9,9 @@ from collections.abc import Sequence
 
 from tpcd.quality.channels import check_channels
 from tpcd.quality.finding import Finding
+from tpcd.quality.rotation import check_poses
 from tpcd.quality.stream import Stream
+from tpcd.quality.units import check_units
 
 
 def check_recording(streams: Sequence[Stream]) -> tuple[Finding, ...]:
@@ -17,4 +19,4 @@ def check_recording(streams: Sequence[Stream]) -> tuple[Finding, ...]:
 
     Their times are [s since the first sample] of the earliest stream.
     """
-    return (*check_channels(streams),)
+    return (*check_channels(streams), *check_poses(streams), *check_units(streams))

@@ -83,8 +83,9 @@ def _jumps(stream: Stream) -> Iterator[Finding]:
     """Places and rotations that no arm gets to from one sample to the next."""
     entries = _columns(stream, QUATERNION)
     names: tuple[str, ...] = tuple(n for n in ("x", "y", "z") if n in stream.channels)
-    if names:
-        steps = np.linalg.norm(np.diff(_columns(stream, names), axis=0), axis=1)
+    places = _columns(stream, names) if names else None
+    if places is not None:
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
         yield from _told_jumps(stream, names, steps, "m")
     if entries is not None:
         with np.errstate(divide="ignore", invalid="ignore"):

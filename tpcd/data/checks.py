@@ -16,6 +16,8 @@ import numpy as np
 from tpcd.data.header import LARGEST_LENGTH, SENSOR_NAMES
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
+from tpcd.quality.episode_rows import check_repeats
+from tpcd.quality.finding import Finding
 
 if TYPE_CHECKING:
     from tpcd.data.episode import Episode
@@ -198,10 +200,22 @@ def check_episode(episode: Episode) -> list[str]:
             )
     if not significant.any() and not (felt.sum(0) >= LEAST_FELT).any():
         warnings.append(NO_CONTACT)
+    warnings += map(str, repeated_readings(episode))
     silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
     if silent:
         warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")
     return warnings
+
+
+def repeated_readings(episode: Episode) -> tuple[Finding, ...]:
+    """Rows whose readings were repeated by a sensor that froze, or was at the end of its range."""
+    return check_repeats(
+        episode.commands.numpy(),
+        episode.poses.numpy(),
+        episode.wrenches.numpy(),
+        episode.stiffness.numpy(),
+        episode.sensor_std.numpy(),
+    )
 
 
 def check_units(episode: Episode) -> None:

@@ -25,6 +25,7 @@ ROTATIONS = ("rx", "ry", "rz", "qx", "qy", "qz", "qw", "e1", "e2", "e3", "phi")
 POSE = (*POSITIONS, *ROTATIONS)
 MIXED = np.sqrt([1.0, 2.0, 3.0, 5.0])
 """A sum with these weights changes where any of its parts does."""
+MOST_LISTED = 6
 TOGETHER = 2
 """Channels whose stretches begin and end within so many samples share one cause."""
 
@@ -69,7 +70,7 @@ def channels_of(streams: Sequence[Stream], names: Sequence[str]) -> Iterator[Cha
 
 def check_channels(streams: Sequence[Stream]) -> tuple[Finding, ...]:
     """What is wrong with single channels; times are [s] on the clock of the streams."""
-    found: list[Finding] = []
+    found = [each for stream in streams for each in _missing(stream)]
     for group in (POSE, WRENCH):
         for stream in streams:
             channels = list(channels_of([stream], group))
@@ -99,6 +100,28 @@ def _stretches(channel: Channel, group: Sequence[str]) -> Iterator[tuple[str, Ch
             yield "clipped" if each.value in ends else "frozen", channel, each
     for place in find_spikes(channel.values, channel.habit.step):
         yield "spike", channel, Stretch(int(place), int(place) + 1, float(channel.values[place]))
+
+
+def _missing(stream: Stream) -> Iterator[Finding]:
+    """Samples that hold no number."""
+    lacking = ~np.isfinite(stream.values)
+    rows = np.flatnonzero(lacking.any(1))
+    if len(rows):
+        names = tuple(n for k, n in enumerate(stream.channels) if lacking[:, k].any())
+        first, last = stream.times[rows[[0, -1]]]
+        told = (
+            f"{len(rows)} of {len(stream.times)} samples lack a number ({', '.join(names)}; rows"
+            f" {_listed(rows)}; from {first:.4g} to {last:.4g} s) and are not used"
+        )
+        yield Finding("missing", Weight.NOTE, told, names)
+
+
+def _listed(rows: Int[np.ndarray, " k"]) -> str:
+    """Rows as ranges, the first few of them."""
+    cuts = np.flatnonzero(np.diff(rows) > 1)
+    firsts, lasts = rows[np.append(0, cuts + 1)], rows[np.append(cuts, len(rows) - 1)]
+    parts = [f"{a}" if a == b else f"{a} to {b}" for a, b in zip(firsts, lasts, strict=True)]
+    return ", ".join(parts[:MOST_LISTED]) + (", …" if len(parts) > MOST_LISTED else "")
 
 
 def _manner(channel: Channel) -> Iterator[Finding]:
@@ -141,16 +164,19 @@ def _finding(kind: str, channel: Channel, names: list[str], stretch: Stretch) ->
     rows = int(channel.samples[stretch.first]), int(channel.samples[stretch.end - 1]) + 1
     who, alone = ", ".join(names), len(names) == 1 and names[0] != "rotation"
     during = f"from {start:.4g} to {end:.4g} s ({count} samples, rows {rows[0]} to {rows[1] - 1})"
-    remedy = "left out; look at the sensor's connection and driver"
+    remedy = "look at the sensor's connection and driver"
     if kind == "spike":
         size = stretch.value - channel.values[stretch.first - 1]
         what = f"a spike of {size:.4g}" if alone else "a spike"
         told = f"{who}: {what} at {start:.4g} s (row {rows[0]})"
+        # Whoever interpolates between samples must not use it on either side.
+        start, end = (float(times[stretch.first + k]) for k in (-1, 1))
+        remedy = "look at the sensor's cable and driver"
     elif kind == "clipped":
         told = (
             f"{who}: at the end of its range{f', {stretch.value:.6g},' if alone else ''} {during}"
         )
-        remedy = "left out; press less, or use a sensor with a larger range"
+        remedy = "press less, or use a sensor with a larger range"
     else:
         told = f"{who}: frozen {f'at {stretch.value:.6g} ' if alone else ''}{during}"
         if channel.habit.lively:

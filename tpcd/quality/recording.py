@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tpcd.quality.channels import check_channels
+from tpcd.quality.clocks import check_clocks
 from tpcd.quality.finding import Finding
 from tpcd.quality.rotation import check_poses
 from tpcd.quality.stream import Stream
@@ -17,6 +18,11 @@ from tpcd.quality.units import check_units
 def check_recording(streams: Sequence[Stream]) -> tuple[Finding, ...]:
     """All findings of the streams of one recording, in SI units, as they were recorded.
 
-    Their times are [s since the first sample] of the earliest stream.
+    The times of findings are those of the streams.
     """
-    return (*check_channels(streams), *check_poses(streams), *check_units(streams))
+    return (
+        *check_clocks(streams),
+        *check_channels(streams),
+        *check_poses(streams),
+        *check_units(streams),
+    )

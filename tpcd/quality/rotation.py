@@ -103,10 +103,14 @@ def _told_jumps(
         return
     usual = float(np.quantile(steps[known], NEARLY_ALL))
     regular = spacing <= 4.0 * np.median(spacing)
-    far = np.flatnonzero(known & regular & (steps > max(LEAST[unit], FAR * usual)))
+    jumps = known & regular & (steps > max(LEAST[unit], FAR * usual))
+    # There and back is a spike, which is told of its channel.
+    back = np.zeros_like(jumps)
+    back[1:] = jumps[1:] & jumps[:-1]
+    far = np.flatnonzero(jumps & ~back & ~np.append(back[1:], False))
     if len(far):
         k = int(far[np.argmax(steps[far])])
-        more = f", and {len(far) - 1} more such jumps" if len(far) > 1 else ""
+        more = f", and {len(far) - 1} times more" if len(far) > 1 else ""
         yield Finding(
             "jump",
             Weight.DOUBT,

@@ -1,0 +1,232 @@
+"""Any recording, read as far as it can be and checked: streams, findings, noise, arm and sensor.
+
+A recording that cannot be imported is checked all the same: without a pose the wrench alone, and
+what is missing is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tpcd.data.checks import check_episode, repeated_readings
+from tpcd.data.episode import COLUMNS, Episode
+from tpcd.data.files import locate, read_episode
+from tpcd.data.noise import check_noise
+from tpcd.errors import EpisodeError
+from tpcd.logs.bags import is_bag, read_bag
+from tpcd.logs.columns import log_from_columns, parse_map, read_numbers
+from tpcd.logs.log import Log, LogError
+from tpcd.logs.table import Columns, read_columns
+from tpcd.quality.finding import Finding, Weight, usable
+from tpcd.quality.identify import identify
+from tpcd.quality.noise import RestNoise, check_noise_at_rest, noise_at_rest
+from tpcd.quality.quantity import Quantity
+from tpcd.quality.recording import check_recording
+from tpcd.quality.stream import Stream
+from tpcd.quality.suggest import Suggestion, suggest_map
+
+LEAST_USABLE = 0.5
+"""A recording of which less than this part of the time is left is not usable."""
+ZERO = "nothing recorded"
+"""Name of a column of zeros that stands in for positions which were not recorded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """What was found in one recording or episode."""
+
+    path: Path
+    kind: str
+    """recording or episode"""
+    streams: tuple[Stream, ...]
+    findings: tuple[Finding, ...]
+    noises: tuple[RestNoise, ...] = ()
+    quantities: tuple[Quantity, ...] = ()
+    untold: str = ""
+    """Why nothing can be said of arm and sensor."""
+    suggestion: Suggestion | None = None
+    """Which columns look like what; None where there are none to choose from."""
+    mapped: tuple[str, ...] = ()
+    """The column map that was used."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def left_out(self) -> float:
+        """The part of the samples that no step can use."""
+        parts = []
+        for stream in self.streams:
+            own = [f for f in self.findings if not f.channels or set(f.channels) & _own(stream)]
+            parts.append(
+                float(1.0 - usable(stream.times, own).mean()) if len(stream.times) else 0.0
+            )
+        return max(parts, default=0.0)
+
+
+def check_file(
+    path: Path,
+    entries: Sequence[str] = (),
+    topics: Sequence[str] = (),
+    euler: str = "ZYX",
+    rate: float | None = None,
+    stiffness: Sequence[float] | None = None,
+) -> Checked:
+    """Read and check a recording or an episode; raises `LogError` or `EpisodeError` for one that
+    cannot be read at all, `ValueError` for options that do not fit it."""
+    if is_bag(path) and not _is_episode(path):
+        if entries or rate is not None:
+            raise ValueError("map and rate are for tables; name a bag's topics with --topics")
+        log = read_bag(path, topics)
+        return _checked(log, log.streams, log.findings, stiffness, notes=log.notes)
+    if topics:
+        raise ValueError("topics are for bags; name a table's columns with --map")
+    if not entries and _is_episode(path):
+        return _check_rows(path)
+    columns = read_columns(path)
+    suggestion = suggest_map(columns)
+    used = tuple(entries) or suggestion.entries
+    if not used:
+        raise LogError(
+            path,
+            "no column is named as a pose or a wrench",
+            f"map them with --map NAME=COLUMN; the columns are {', '.join(list(columns)[:40])}",
+        )
+    notes = (
+        [] if entries else [f"no map was given; taken is what the names suggest: {suggestion.line}"]
+    )
+    log, streams, problem = _read_table(path, columns, used, euler, rate, notes)
+    found = check_recording(streams) if log is None else log.findings
+    return replace(
+        _checked(log, streams, found, stiffness, problem, notes),
+        path=path,
+        suggestion=suggestion,
+        mapped=used,
+    )
+
+
+def _is_episode(path: Path) -> bool:
+    """Whether a path names an episode: a table with its YAML beside it."""
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        return False
+    try:
+        return locate(path)[1].is_file()
+    except EpisodeError:
+        return False
+
+
+def _read_table(
+    path: Path,
+    columns: Columns,
+    entries: Sequence[str],
+    euler: str,
+    rate: float | None,
+    notes: list[str],
+) -> tuple[Log | None, tuple[Stream, ...], str]:
+    """The recording of a table; without a pose or a wrench, its streams and what it lacks."""
+    mapped = parse_map(entries, columns, path)
+    if "time" not in mapped and rate is None:
+        # The order of the samples is all that is known; what takes seconds counts samples.
+        rate = 1.0
+        notes.append("no column of times and no --rate: one sample a second is taken")
+    try:
+        log = log_from_columns(columns, entries, path, euler, rate)
+    except LogError as error:
+        turned = [n for n in mapped if n[0] in "qre" or n == "phi"]
+        if not {"F_x", "F_z"} <= set(mapped) or {"x", "z"} <= set(mapped) or not turned:
+            return None, _streams(path, columns, mapped, rate), error.problem
+        columns[ZERO] = np.zeros(len(next(iter(columns.values()))))
+        more = [f"{name}={ZERO}" for name in ("x", "z") if name not in mapped]
+        log = log_from_columns(columns, [*entries, *more], path, euler, rate)
+        log = replace(log, missing=log.missing | {"x", "z"} - set(mapped))
+        notes.append("no positions were recorded: rotation and wrench alone are checked")
+    notes += log.notes
+    return log, tuple(_recorded(stream, log.missing) for stream in log.streams), ""
+
+
+def _recorded(stream: Stream, missing: frozenset[str]) -> Stream:
+    """The stream without channels that only stand in for something."""
+    kept = [k for k, name in enumerate(stream.channels) if name not in missing]
+    names = tuple(stream.channels[k] for k in kept)
+    return replace(stream, channels=names, values=stream.values[:, kept])
+
+
+def _streams(
+    path: Path, columns: Columns, mapped: dict[str, tuple[str, str]], rate: float | None
+) -> tuple[Stream, ...]:
+    """What the map gives, as one stream for set points and one for the rest."""
+    values, _ = read_numbers(columns, mapped, path)
+    times = values.pop("time", None)
+    if times is None:
+        times = np.arange(len(next(iter(columns.values())))) / (rate or 1.0)
+    timed = np.isfinite(times)
+    groups = ([n for n in values if not n.startswith("u_")], [n for n in values if n[:2] == "u_"])
+    return tuple(
+        Stream(
+            path.name, tuple(names), times[timed], np.stack([values[n][timed] for n in names], 1)
+        )
+        for names in groups
+        if names
+    )
+
+
+def _checked(
+    log: Log | None,
+    streams: Sequence[Stream],
+    findings: Sequence[Finding],
+    stiffness: Sequence[float] | None,
+    problem: str = "",
+    notes: Sequence[str] = (),
+) -> Checked:
+    noises = noise_at_rest(streams)
+    found = (*findings, *check_noise_at_rest(noises))
+    quantities: tuple[Quantity, ...] = ()
+    if log is not None:
+        quantities = identify(replace(log, findings=found), stiffness)
+    path = log.path if log is not None else Path()
+    return Checked(
+        path, "recording", tuple(streams), found, noises, quantities, problem, notes=tuple(notes)
+    )
+
+
+def _check_rows(path: Path) -> Checked:
+    """An episode: its rows, and what they tell of arm and sensor."""
+    episode = read_episode(path)
+    repeats = repeated_readings(episode)
+    told = {str(each) for each in repeats}
+    doubts = [sentence for sentence in check_episode(episode) if sentence not in told]
+    try:
+        doubts += check_noise(episode)
+    except EpisodeError as error:
+        doubts.append(error.problem)
+    findings = (*repeats, *(Finding("row", Weight.DOUBT, each) for each in doubts))
+    stream = _rows_stream(episode)
+    table = Columns(zip(stream.channels, stream.values.T, strict=True))
+    table["time"] = stream.times
+    log = log_from_columns(
+        table,
+        ["time=time", *(f"{name}={name}" for name in stream.channels)],
+        episode.path or path,
+    )
+    quantities = identify(replace(log, findings=()), tuple(episode.stiffness.tolist()))
+    return Checked(episode.path or path, "episode", (stream,), findings, quantities=quantities)
+
+
+def _rows_stream(episode: Episode) -> Stream:
+    """The rows as samples, at their times where these are known, else a second apart."""
+    values = np.column_stack(
+        (episode.commands.numpy(), episode.poses.numpy(), episode.wrenches.numpy())
+    )
+    times = np.arange(len(episode), dtype=np.float64)
+    recorded = episode.extra.get("time_s")
+    if recorded is not None and recorded.dtype.kind == "f" and (np.diff(recorded) > 0).all():
+        times = recorded - recorded[0]
+    name = episode.path.name if episode.path else "episode"
+    return Stream(name, COLUMNS[1:], times, values)
+
+
+def _own(stream: Stream) -> set[str]:
+    """Channels of a stream, a rotation being one."""
+    return {*stream.channels, "rotation"} if "u_x" not in stream.channels else {*stream.channels}

@@ -1,0 +1,277 @@
+"""Stiffness, friction, frame, rotation and reference point from w - K (x - u).
+
+For each axis, in axes in which the controller's stiffness is diagonal,
+
+    w = K e + zero + c sign(motion) + D (de/dt) + G (du/dt),    e = x - u.
+
+Both sides are noisy: friction of the arm is in e, drift of the sensor in w. Fitting w to e gives a
+stiffness that is too small, fitting e to w one that is too large, and what is true lies between
+them (Frisch 1934); the intervals hold both ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tpcd.logs.log import AXES
+from tpcd.quality.blocks import (
+    Estimate,
+    block_edges,
+    correlation_time,
+    jackknife,
+    moments,
+    partial,
+    solve,
+)
+from tpcd.quality.payload import skew
+from tpcd.quality.springs import Springs
+
+WIDE = np.radians(10.0)
+"""An end effector that turned less shows nothing of which axes a wrench is in [rad]."""
+
+OWN = 6
+"""Columns w, e, 1, direction, rates of e and u come first; what the axes share comes after."""
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """One axis of w = K e + zero + c sign(motion) + D (de/dt)."""
+
+    letter: str
+    index: int
+    low: Estimate
+    """K by fitting w to e."""
+    high: Estimate
+    """K by fitting e to w."""
+    zero: tuple[Estimate, Estimate]
+    """What is left at e = 0 with either K."""
+    friction: tuple[Estimate, Estimate]
+    explained: float
+    """Part of the variance of w that e explains."""
+    time: float
+    """How many samples apart readings are independent, for what e explains."""
+
+    @property
+    def name(self) -> str:
+        """x, y, z, rx, ry, rz."""
+        return ("" if self.letter == "F" else "r") + AXES[self.index]
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Of the stiffness."""
+        ends = (*self.low.bounds(), *self.high.bounds())
+        return float(min(ends)), float(max(ends))
+
+    @property
+    def stiffness(self) -> float:
+        """Between both ends, in ratio."""
+        low, high = float(self.low.value), float(self.high.value)
+        return float(np.sign(low) * np.sqrt(abs(low * high)))
+
+    @property
+    def told(self) -> bool:
+        """Whether e explains anything of w."""
+        low, high = self.interval
+        return low * high > 0 and np.isfinite(high)
+
+
+@dataclass(frozen=True, eq=False)
+class Parity:
+    """The springs of a recording in one pair of frames."""
+
+    springs: Springs
+    frame: str
+    """Axes in which the wrench is given: world or tool."""
+    axes: str
+    """Axes in which the stiffness is diagonal."""
+    told: tuple[Axis, ...]
+    left: Float[np.ndarray, " B"]
+    """Sum of squares of what is left of the forces in each block [N^2]."""
+
+    def stiffness(self, given: Sequence[float] | None = None) -> Float[np.ndarray, " 6"]:
+        """Of each axis, with the sign of the wrench: what was given, or what fits best; 0 where
+        the wrench does not go with x - u at all."""
+        found = np.zeros(6)
+        for axis in self.told:
+            if np.isfinite(axis.stiffness):
+                found[axis.index + (3 if axis.letter == "T" else 0)] = axis.stiffness
+        if given is None:
+            return found
+        sign = -1.0 if np.sign(found).sum() < 0 else 1.0
+        return sign * np.array(given, dtype=float)
+
+
+def readings(springs: Springs, letter: str, frame: str, axes: str) -> Float[np.ndarray, "n 3"]:
+    """Forces or torques, given in axes of `frame`, in axes of `axes`."""
+    given = springs.log.forces if letter == "F" else springs.log.torques
+    return given if frame == axes else springs.turned(springs.in_world(given, frame), axes)
+
+
+def displacements(springs: Springs, letter: str, axes: str) -> Float[np.ndarray, "n 3"]:
+    """The springs' part that goes with the letter, in axes of `axes`."""
+    away = springs.away[:, :3] if letter == "F" else springs.away[:, 3:]
+    return springs.turned(away, axes)
+
+
+def fit_parity(springs: Springs, frame: str, axes: str) -> Parity:
+    """Fit every axis of which reading and set point were recorded."""
+    told, left = [], np.zeros(len(springs.edges))
+    for letter in "FT":
+        for k in springs.axes(letter):
+            found = _axis(springs, letter, k, frame, axes)
+            if found is None:
+                continue
+            axis, squares = found
+            told.append(axis)
+            if letter == "F":
+                left += squares
+    return Parity(springs, frame, axes, tuple(told), left)
+
+
+def _axis(
+    springs: Springs, letter: str, k: int, frame: str, axes: str
+) -> tuple[Axis, Float[np.ndarray, " B"]] | None:
+    wrench = readings(springs, letter, frame, axes)[:, k]
+    away = displacements(springs, letter, axes)[:, k]
+    if np.ptp(away) == 0 or np.ptp(wrench) == 0:
+        return None
+    columns = np.column_stack((wrench, away, *_nuisance(springs, letter, k, frame, axes)))
+    whole = columns.T @ columns
+    weights = np.append(1.0, -solve(whole[1:, 1:], whole[1:, :1])[:, 0])
+    left = columns @ weights
+    time = correlation_time(left * (away - away.mean()))
+    sums = moments(columns, block_edges(len(away), time))
+
+    def ends(products: np.ndarray) -> np.ndarray:
+        inner = partial(products, 2)
+        low = inner[0, 1] / inner[1, 1] if inner[1, 1] > 0 else np.nan
+        high = inner[0, 0] / inner[0, 1] if inner[0, 1] else np.inf
+        found = [low, high]
+        for slope in (low, high):
+            right = products[2:, 0] - slope * products[2:, 1]
+            # Bias and weight belong to the zero, but not to friction.
+            zero = solve(products[2:OWN, 2:OWN], right[: OWN - 2, None])[0, 0]
+            found += [zero, solve(products[2:, 2:], right[:, None])[1, 0]]
+        return np.array(found)
+
+    with np.errstate(invalid="ignore"):
+        found = jackknife(ends, sums)
+    parts = [Estimate(v, e, found.freedom) for v, e in zip(found.value, found.error, strict=True)]
+    inner = partial(whole, 2)
+    explained = float(inner[0, 1] ** 2 / max(inner[0, 0] * inner[1, 1], 1e-300))
+    zero, friction = (parts[2], parts[4]), (parts[3], parts[5])
+    axis = Axis(letter, k, parts[0], parts[1], zero, friction, explained, time)
+    return axis, np.add.reduceat(left**2, springs.edges)
+
+
+def _nuisance(
+    springs: Springs, letter: str, k: int, frame: str, axes: str
+) -> list[Float[np.ndarray, " n"]]:
+    """What else is in w: zero, friction, damping, lag; bias and weight where the arm turned; and
+    in a torque the force's about another point."""
+    away = displacements(springs, letter, axes)[:, k]
+    column = k + (3 if letter == "T" else 0)
+    rate = np.gradient(away, springs.log.times) if len(away) > 2 else np.zeros_like(away)
+    asked = springs.turned(springs.asked[:, :3] if column < 3 else springs.asked[:, 3:], axes)
+    found = [np.ones_like(away), _directions(springs, column, axes), rate, asked[:, k]]
+    if springs.spread > WIDE:
+        other = springs.frames[:, k] if axes == "world" else springs.frames[:, :, k]
+        found += list(other.T)
+    if letter == "T" and springs.axes("F"):
+        force = readings(springs, "F", frame, axes)
+        found += [force[:, j] for j in springs.axes("F") if j != k]
+    return found
+
+
+def _directions(springs: Springs, column: int, axes: str) -> Float[np.ndarray, " n"]:
+    part = springs.directions[:, :3] if column < 3 else springs.directions[:, 3:]
+    return springs.turned(part, axes)[:, column % 3]
+
+
+def choose_frames(springs: Springs) -> tuple[Parity, bool, bool]:
+    """The pair of frames that leaves least of the forces, and whether that of the wrench and that
+    of the stiffness are told: whether another leaves more in blocks throughout."""
+    frames = ("world", "tool")
+    if springs.spread < 1e-6 or len(springs.axes("F")) < 2:
+        return fit_parity(springs, "world", "world"), False, False
+    tried = {(f, a): fit_parity(springs, f, a) for f in frames for a in frames}
+    best = min(tried.values(), key=lambda each: each.left.sum())
+    other = {"world": "tool", "tool": "world"}
+
+    def surer(rival: Parity) -> bool:
+        gain = jackknife(
+            lambda sums: np.log(sums[1] / sums[0]) if (sums > 0).all() else np.array(0.0),
+            np.stack((best.left, rival.left), axis=1),
+        )
+        return bool(gain.bounds()[0] > 0)
+
+    if springs.spread < WIDE:
+        return best, False, False
+    rivals = [tried[other[best.frame], a] for a in frames]
+    wrench = all(surer(rival) for rival in rivals)
+    return best, wrench, all(surer(tried[f, other[best.axes]]) for f in frames)
+
+
+def sensor_turn(parity: Parity) -> Estimate | None:
+    """Rotation vector of the sensor's axes relative to the end effector's [rad], from forces that
+    are not along K e; None where K is not told in all axes.
+
+    F = f + rho x f with f = K e in axes of the end effector, where both factors of the cross
+    product hold K by fitting w to e, in which its error cancels.
+    """
+    springs = parity.springs
+    axes = [axis for axis in parity.told if axis.letter == "F" and axis.told]
+    if len(axes) < 3:
+        return None
+    slopes = np.array([float(axis.low.value) for axis in axes])
+    pushed = displacements(springs, "F", parity.axes) * slopes
+    into_tool = pushed if parity.axes == "tool" else springs.turned(pushed, "tool")
+    return _stacked(parity, "F", -skew(into_tool), 3)
+
+
+def sensor_point(parity: Parity) -> Estimate | None:
+    """Where the point that torques are about lies, from the end effector's origin, in its axes [m]:
+    T = T_0 - r x F; None where no torques, or not all forces, were recorded."""
+    springs = parity.springs
+    if len(springs.axes("F")) < 3 or len(springs.axes("T")) < 3:
+        return None
+    force = readings(springs, "F", parity.frame, "tool")
+    return _stacked(parity, "T", skew(force), 3)
+
+
+def _stacked(parity: Parity, letter: str, extra: Float[np.ndarray, "n 3 q"], count: int):
+    """Coefficients of `extra`, columns in axes of the end effector that all axes share, beside a
+    stiffness, zero, friction and damping of each axis."""
+    springs, axes = parity.springs, parity.axes
+    if axes == "world":
+        extra = np.einsum("nij,njq->niq", springs.frames, extra)
+    wrench = readings(springs, letter, parity.frame, axes)
+    own = [
+        np.column_stack(
+            (
+                displacements(springs, letter, axes)[:, k],
+                *_nuisance(springs, letter, k, parity.frame, axes)[
+                    : OWN + 1 if springs.spread > WIDE else OWN - 2
+                ],
+            )
+        )
+        for k in range(3)
+    ]
+    width = own[0].shape[1]
+    times = [axis.time for axis in parity.told if axis.letter == letter]
+    edges = block_edges(len(wrench), max(times, default=1.0))
+    sums = 0.0
+    for k in range(3):
+        columns = np.zeros((len(wrench), 1 + count + 3 * width))
+        columns[:, 0], columns[:, 1 : 1 + count] = wrench[:, k], extra[:, k]
+        columns[:, 1 + count + k * width : 1 + count + (k + 1) * width] = own[k]
+        sums = sums + moments(columns, edges)
+
+    def coefficients(products: np.ndarray) -> np.ndarray:
+        return solve(products[1:, 1:], products[1:, :1])[:count, 0]
+
+    return jackknife(coefficients, np.asarray(sums))

@@ -1,4 +1,4 @@
-"""Recordings of an arm under impedance control in three dimensions, of which everything is known."""
+"""Recordings of an arm under impedance control in three dimensions, all of which is known."""
 
 from __future__ import annotations
 
@@ -50,17 +50,30 @@ def smooth(random, times, scale, columns):
     return np.stack([np.convolve(raw[:, k], kernel, mode="valid") for k in range(columns)], axis=1)
 
 
-def last_direction(values, reach):
-    told, way, extreme = np.zeros(len(values)), 0.0, values[0]
-    for k, value in enumerate(values):
-        if way >= 0 and value < extreme - reach:
-            way, extreme = -1.0, value
-        elif way <= 0 and value > extreme + reach:
-            way, extreme = 1.0, value
-        elif (value - extreme) * way > 0:
-            extreme = value
-        told[k] = way
-    return told
+def play(targets, half):
+    """What follows `targets` but is held by friction within `half` of them."""
+    found = np.empty_like(targets)
+    last = targets[0]
+    for k, target in enumerate(targets):
+        last = np.clip(last, target - half, target + half)
+        found[k] = last
+    return found
+
+
+def turned_play(targets, half):
+    """The same of rotations, about the world's axes."""
+    found = np.empty((len(targets), 3, 3))
+    matrices = targets.as_matrix()
+    last = matrices[0]
+    for k, target in enumerate(matrices):
+        off = last @ target.T
+        # Friction holds less than a tenth of a radian.
+        away = 0.5 * np.array([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]])
+        x, y, z = np.clip(away, -half, half)
+        turn = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        last = target + turn @ target + 0.5 * turn @ turn @ target
+        found[k] = last
+    return Rotation.from_matrix(found)
 
 
 def moving(arm: Arm, seed: int, seconds: float = 200.0, rate: float = 50.0) -> Log:
@@ -79,13 +92,13 @@ def moving(arm: Arm, seed: int, seconds: float = 200.0, rate: float = 50.0) -> L
     wrench = smooth(random, times, 1.0, 6) * np.array([arm.load] * 3 + [arm.load / 20] * 3)
     wrench = wrench * touching
     stiffness, friction = np.array(arm.stiffness), np.array(arm.friction)
-    free = np.concatenate((late(path), late(turns)), axis=1)
-    moved = free + wrench / stiffness
-    ways = np.stack([last_direction(column, 1e-3) for column in moved.T], axis=1)
-    away = (wrench - friction * ways) / stiffness
-    positions = free[:, :3] + away[:, :3]
-    rotations = Rotation.from_rotvec(away[:, 3:]) * Rotation.from_rotvec(free[:, 3:]) * base
-    rotations = Rotation.from_rotvec(arm.angle_std * random.standard_normal((len(times), 3))) * rotations
+    half = friction / stiffness
+    # Springs, contact and friction balance; the arm stays where friction can hold it.
+    positions = play(late(path) + wrench[:, :3] / stiffness[:3], half[:3])
+    pushed = Rotation.from_rotvec(wrench[:, 3:] / stiffness[3:])
+    rotations = turned_play(pushed * Rotation.from_rotvec(late(turns)) * base, half[3:])
+    jitter = arm.angle_std * random.standard_normal((len(times), 3))
+    rotations = Rotation.from_rotvec(jitter) * rotations
     forces, torques = sensed(arm, rotations, wrench[:, :3], wrench[:, 3:])
     noise = random.standard_normal((len(times), 6)) + arm.slow * smooth(random, times, 1.0, 6)
     return Log(

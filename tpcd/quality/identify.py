@@ -8,16 +8,18 @@ Nothing here assumes a plane: a planar recording is one with `missing` component
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from tpcd.logs.log import Log
 from tpcd.quality.blocks import block_edges, correlation_time
-from tpcd.quality.impedance import LOADS, NAMES, PRESS, impedance
-from tpcd.quality.parity import Parity, displacements
+from tpcd.quality.impedance import NAMES, PRESS, impedance
+from tpcd.quality.parity import Parity, spring_wrench
 from tpcd.quality.payload import ORIENTATIONS, payload, weigh
 from tpcd.quality.quantity import Quantity, untold
-from tpcd.quality.rests import find_rests, observe, observe_rests
+from tpcd.quality.rests import UP, Observed, find_rests, observe_rests, recorded_axes
 from tpcd.quality.springs import springs
 
 CLEARER = 4.0
@@ -39,16 +41,7 @@ def identify(log: Log, stiffness: Sequence[float] | None = None) -> tuple[Quanti
         return (*_from_rests(log), *_without_commands())
     parity, told = impedance(sampled, stiffness)
     load = _from_parity(parity, stiffness)
-    by_name = {each.name: each for each in load}
-    for each in told:
-        before = by_name.get(each.name)
-        if before is None or not before.told or (each.told and _width(each) < _width(before)):
-            by_name[each.name] = each
-    return tuple(by_name.values())
-
-
-def _width(told: Quantity) -> float:
-    return np.inf if told.interval is None else told.interval[1] - told.interval[0]
+    return (*told, *load)
 
 
 def _from_rests(log: Log) -> tuple[Quantity, ...]:
@@ -74,35 +67,61 @@ def _from_rests(log: Log) -> tuple[Quantity, ...]:
 
 
 def _from_parity(parity: Parity, stiffness: Sequence[float] | None) -> tuple[Quantity, ...]:
-    """Payload from w - K (x - u), which holds none of what is touched, over blocks of time."""
+    """Payload, bias, rotation and point of the sensor from what it reads besides K (x - u), which
+    is all that the world presses with. Intervals hold those of both ends of the stiffness."""
+    found = parity.stiffness()
+    known = found[0] != 0
+    if stiffness is not None:
+        found, known = (parity.sign * np.array(stiffness, dtype=float),), np.ones(6, dtype=bool)
+    tables = []
+    for each in found:
+        seen = _beside_springs(parity, each, bool(known[3:].all()))
+        tables.append(payload(seen, "blocks of time", "weight beyond what the springs carry"))
+    return tuple(_hull(same) for same in zip(*tables, strict=True))
+
+
+def _beside_springs(parity: Parity, stiffness: Float[np.ndarray, " 6"], torques: bool) -> Observed:
+    """Every sample, with K (x - u) as what is pressed; torques' part only where it is known."""
     sampled = parity.springs
     log = sampled.log
-    known = parity.stiffness(stiffness)
-    left = []
-    for letter, given, part in (("F", log.forces, known[:3]), ("T", log.torques, known[3:])):
-        spring = displacements(sampled, letter, parity.axes) * part
-        if parity.axes != parity.frame:
-            spring = (
-                sampled.in_world(spring, "tool")
-                if parity.axes == "tool"
-                else sampled.turned(spring, "tool")
-            )
-        left.append(given - spring)
-    series = [column for part in left for column in part.T if np.ptp(column) > 0]
-    time = max((correlation_time(column) for column in series), default=1.0)
-    edges = np.append(block_edges(len(log), time), len(log))
-    groups = [np.arange(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    seen = observe(log, groups, parity.frame, left[0], left[1])
-    return payload(seen, "blocks of w - K (x - u)", "weight beyond what the springs carry")
+
+    def in_tool(vectors: Float[np.ndarray, "n 3"], frame: str) -> Float[np.ndarray, "n 3"]:
+        return vectors if frame == "tool" else sampled.turned(vectors, "tool")
+
+    pressed, twisted = (
+        in_tool(spring_wrench(parity, letter, part), parity.axes)
+        for letter, part in (("F", stiffness[:3]), ("T", stiffness[3:]))
+    )
+    forces, torque = in_tool(log.forces, parity.frame), in_tool(log.torques, parity.frame)
+    left = [column for column in (forces - pressed).T if np.ptp(column) > 0]
+    time = max((correlation_time(column) for column in left), default=1.0)
+    return Observed(
+        in_tool(np.broadcast_to(UP, forces.shape), "world"),
+        forces,
+        torque,
+        log.times,
+        recorded_axes(log, "F"),
+        recorded_axes(log, "T"),
+        pressed,
+        twisted if torques else None,
+        block_edges(len(log), time),
+    )
+
+
+def _hull(same: Sequence[Quantity]) -> Quantity:
+    """The first, with an interval that holds all of theirs."""
+    untold_ones = [each for each in same if not each.told]
+    if untold_ones:
+        return untold_ones[0]
+    ends = [end for each in same for end in each.interval or ()]
+    return replace(same[0], interval=(min(ends), max(ends))) if ends else same[0]
 
 
 def _without_commands() -> tuple[Quantity, ...]:
     reason, motion = "no set points were recorded", f"record the commands, and {PRESS}"
-    names = [
-        f"{kind}_{axis}" for kind in ("stiffness", "gain", "arm_friction") for axis in NAMES
+    told = [
+        Quantity(f"{kind}_{axis}", units[len(axis) - 1], reason=reason, motion=motion)
+        for kind, units in (("stiffness", ("N/m", "N·m/rad")), ("arm_friction", ("N", "N·m")))
+        for axis in NAMES
     ]
-    return (
-        *untold([name for name in names if name[-2:-1] != "r" and "gain" not in name], "", reason, motion),
-        *untold(("pose_lag", "wrench_lag"), "s", reason, motion),
-        *untold([f"sensor_point_{axis}" for axis in "xyz"], "m", reason, LOADS),
-    )
+    return (*told, *untold(("pose_lag", "wrench_lag"), "s", reason, motion))

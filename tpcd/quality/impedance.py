@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tpcd.logs.log import AXES
 from tpcd.quality.blocks import Estimate
 from tpcd.quality.lags import pose_lag, wrench_lag
-from tpcd.quality.parity import Axis, Parity, choose_frames, sensor_point, sensor_turn
-from tpcd.quality.quantity import Quantity, untold
+from tpcd.quality.parity import Axis, Parity, choose_frames
+from tpcd.quality.quantity import Quantity
 from tpcd.quality.springs import Springs
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
@@ -23,7 +22,6 @@ CLOSE = 1.5
 PRESS = "press along the axis at three loads, both ways, the largest ten times what friction holds"
 TWIST = "turn about the axis against something fixed, at three loads, both ways"
 TILT = "turn the end effector by 45 degrees about two axes, pressing before and after"
-LOADS = "press along two directions that are not parallel, each at two loads"
 
 
 def impedance(
@@ -36,11 +34,7 @@ def impedance(
     told += [_gain(parity, k, stiffness) for k in range(6)]
     told += [_between(parity, k, "zero") for k in range(6)]
     told += [_between(parity, k, "friction") for k in range(6)]
-    told += _vector(sensor_turn(parity), "sensor_rotation", "rad", "forces beside K (x - u)")
-    told += _vector(
-        sensor_point(parity), "sensor_point", "m", "torques beside forces; from the end effector"
-    )
-    told += [pose_lag(springs), wrench_lag(parity)]
+    told += [pose_lag(parity), wrench_lag(parity)]
     return parity, tuple(told)
 
 
@@ -142,15 +136,3 @@ def _between(parity: Parity, k: int, kind: str) -> Quantity:
         short = f"{1e3 * dead:.2g} mm" if k < 3 else f"{np.degrees(dead):.2g} degrees"
         basis = f"part of w - K (x - u) that has the sign of the last motion: stops {short} short"
     return Quantity(name, unit, value, (low, high), basis=basis)
-
-
-def _vector(found: Estimate | None, name: str, unit: str, basis: str) -> tuple[Quantity, ...]:
-    names = [f"{name}_{axis}" for axis in AXES]
-    if found is None:
-        return untold(names, unit, "w is told beside x - u in fewer than three axes", LOADS)
-    low, high = found.bounds()
-    told = []
-    for k, each in enumerate(names):
-        ends = float(low[k]), float(high[k])
-        told.append(Quantity(each, unit, float(found.value[k]), ends, basis=basis))
-    return tuple(told)

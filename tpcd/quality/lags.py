@@ -22,28 +22,56 @@ FINEST = 80
 """How many either way, at most."""
 EXPLAINED = 0.2
 """The best shift explains so much, or the lag is not told."""
+MOVING = 0.2
+"""Part of the time for which the arm goes on the same way, below which all of it counts."""
+RESOLVED = 0.25
+"""Part of the time between samples that no interval is narrower than, either way: friction and
+noise bend the curve between two shifts."""
 HORIZON = 0.1
 """Motion is compared over at least this time [s]: it has its lag whatever else stands off."""
 
 
-def pose_lag(springs: Springs) -> Quantity:
-    """How long the pose comes after the command [s]."""
-    name, motion = "pose_lag", "move freely to and fro at the speed of use, sampled at 20 Hz or more"
+def pose_lag(parity: Parity) -> Quantity:
+    """How long the pose comes after the command [s], once what the wrench pushes it by is
+    taken away."""
+    springs = parity.springs
+    name, motion = (
+        "pose_lag",
+        "move freely to and fro at the speed of use, sampled at 20 Hz or more",
+    )
     reason = _sparse(springs)
     if reason:
         return Quantity(name, "s", reason=reason, motion=motion)
     log, times = springs.log, springs.log.times
-    assert log.command_positions is not None
+    commands = log.command_positions
+    assert commands is not None
     span = max(1, round(HORIZON / springs.step))
-    moved = log.positions[span:] - log.positions[:-span]
+    kept = [k for k in range(3) if np.ptp(commands[:, k]) > 0]
+    if not kept:
+        return Quantity(name, "s", reason="the command never moves", motion=motion)
+    moved = (log.positions[span:] - log.positions[:-span])[:, kept]
+    force = readings(springs, "F", parity.frame, "world")
+    pushed = (force[span:] - force[:-span])[:, kept]
+    ways = springs.directions[:, kept]
+    # A reversal takes up what friction holds, which looks like a lag.
+    on = (ways[span:] * ways[:-span] > 0).astype(float)
+    if on.mean() < MOVING:
+        on = np.ones_like(on)
 
-    def asked(shift: float) -> Float[np.ndarray, "k 3"]:
-        return _at(times[span:] - shift, times, log.command_positions) - _at(
-            times[:-span] - shift, times, log.command_positions
-        )
+    def asked(shift: float) -> Float[np.ndarray, "k c"]:
+        late = _at(times - shift, times, commands[:, kept])
+        return _besides(on * (late[span:] - late[:-span]), on * pushed)
 
-    # An arm does not move before it is told to.
-    return _lag(springs, name, motion, moved, asked, times[span:], "", centre=False)
+    moved, pushed = on * moved, on * pushed
+    return _lag(springs, name, motion, _besides(moved, pushed), asked, "", centre=False)
+
+
+def _besides(
+    values: Float[np.ndarray, "k c"], others: Float[np.ndarray, "k c"]
+) -> Float[np.ndarray, "k c"]:
+    """What is left of each column once its other is fitted away."""
+    size = (others**2).sum(0)
+    return values - others * (values * others).sum(0) / np.where(size > 0, size, 1.0)
 
 
 def wrench_lag(parity: Parity) -> Quantity:
@@ -66,7 +94,6 @@ def wrench_lag(parity: Parity) -> Quantity:
         motion,
         wrench[:, kept],
         lambda shift: _at(times - shift, times, away[:, kept]),
-        times,
         basis,
         centre=True,
     )
@@ -97,9 +124,11 @@ def _edges(response: np.ndarray, causes: list[np.ndarray]) -> np.ndarray:
     return block_edges(len(left), max(correlation_time(column) for column in left.T))
 
 
-def _lag(springs, name, motion, response, cause, times, basis, centre) -> Quantity:
-    count = int(np.clip(round(LONGEST / springs.step), 2, FINEST))
-    shifts = np.linspace(-LONGEST, LONGEST, 2 * count + 1)
+def _lag(springs, name, motion, response, cause, basis, centre) -> Quantity:
+    # Whole samples: between them interpolation averages noise, which would look like a better fit.
+    stride = -(-round(LONGEST / springs.step) // FINEST) * springs.step
+    count = max(2, round(LONGEST / stride))
+    shifts = stride * np.arange(-count, count + 1)
     edges = _edges(response, [cause(shift) for shift in shifts[:: max(1, count // 8)]])
     sizes = np.diff(np.append(edges, len(response)))[:, None]
     sums = []
@@ -136,6 +165,8 @@ def _lag(springs, name, motion, response, cause, times, basis, centre) -> Quanti
         return Quantity(name, "s", reason=reason, motion=motion)
     found = jackknife(best, stacked)
     low, high = (float(v) for v in found.bounds())
+    least = RESOLVED * stride
+    low, high = min(low, float(found.value) - least), max(high, float(found.value) + least)
     told = f"explains {explained:.0%}; delay, time constant and difference of clocks together"
     basis = f"{told}; {basis}" if basis else told
     return Quantity(name, "s", float(found.value), (low, high), basis=basis)

@@ -1,4 +1,4 @@
-"""Stiffness, friction, frame, rotation and reference point from w - K (x - u).
+"""Stiffness, friction and frames from w - K (x - u).
 
 For each axis, in axes in which the controller's stiffness is diagonal,
 
@@ -11,7 +11,6 @@ them (Frisch 1934); the intervals hold both ends.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,6 @@ from tpcd.quality.blocks import (
     partial,
     solve,
 )
-from tpcd.quality.payload import skew
 from tpcd.quality.springs import Springs
 
 WIDE = np.radians(10.0)
@@ -50,6 +48,8 @@ class Axis:
     zero: tuple[Estimate, Estimate]
     """What is left at e = 0 with either K."""
     friction: tuple[Estimate, Estimate]
+    others: Float[np.ndarray, " 3"]
+    """Coefficients of the sign of motion and of the rates of e and u, between both ends."""
     explained: float
     """Part of the variance of w that e explains."""
     time: float
@@ -92,17 +92,21 @@ class Parity:
     left: Float[np.ndarray, " B"]
     """Sum of squares of what is left of the forces in each block [N^2]."""
 
-    def stiffness(self, given: Sequence[float] | None = None) -> Float[np.ndarray, " 6"]:
-        """Of each axis, with the sign of the wrench: what was given, or what fits best; 0 where
-        the wrench does not go with x - u at all."""
-        found = np.zeros(6)
+    @property
+    def sign(self) -> float:
+        """-1 where the wrench is what the arm exerts, in most axes that tell; else 1."""
+        told = [np.sign(float(axis.low.value)) for axis in self.told if axis.told]
+        return -1.0 if sum(told) < 0 else 1.0
+
+    def stiffness(self) -> tuple[Float[np.ndarray, " 6"], ...]:
+        """Of each axis with the sign of the wrench: what fits best, and both ends of the interval;
+        0 where the data cannot tell."""
+        found = np.zeros((3, 6))
         for axis in self.told:
-            if np.isfinite(axis.stiffness):
-                found[axis.index + (3 if axis.letter == "T" else 0)] = axis.stiffness
-        if given is None:
-            return found
-        sign = -1.0 if np.sign(found).sum() < 0 else 1.0
-        return sign * np.array(given, dtype=float)
+            if axis.told:
+                at = axis.index + (3 if axis.letter == "T" else 0)
+                found[:, at] = (axis.stiffness, *axis.interval)
+        return tuple(found)
 
 
 def readings(springs: Springs, letter: str, frame: str, axes: str) -> Float[np.ndarray, "n 3"]:
@@ -115,6 +119,20 @@ def displacements(springs: Springs, letter: str, axes: str) -> Float[np.ndarray,
     """The springs' part that goes with the letter, in axes of `axes`."""
     away = springs.away[:, :3] if letter == "F" else springs.away[:, 3:]
     return springs.turned(away, axes)
+
+
+def spring_wrench(
+    parity: Parity, letter: str, stiffness: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """What the world presses with, by the springs [N or N·m], in axes of the stiffness: K e, and
+    what friction, damping and lag of the arm add to it; 0 along axes that are not told."""
+    springs, axes = parity.springs, parity.axes
+    found = displacements(springs, letter, axes) * stiffness
+    for axis in parity.told:
+        if axis.letter == letter and stiffness[axis.index]:
+            columns = _nuisance(springs, letter, axis.index, parity.frame, axes)[1 : OWN - 2]
+            found[:, axis.index] += np.column_stack(columns) @ axis.others
+    return found
 
 
 def fit_parity(springs: Springs, frame: str, axes: str) -> Parity:
@@ -155,7 +173,7 @@ def _axis(
             right = products[2:, 0] - slope * products[2:, 1]
             # Bias and weight belong to the zero, but not to friction.
             zero = solve(products[2:OWN, 2:OWN], right[: OWN - 2, None])[0, 0]
-            found += [zero, solve(products[2:, 2:], right[:, None])[1, 0]]
+            found += [zero, *solve(products[2:, 2:], right[:, None])[1 : OWN - 2, 0]]
         return np.array(found)
 
     with np.errstate(invalid="ignore"):
@@ -163,8 +181,9 @@ def _axis(
     parts = [Estimate(v, e, found.freedom) for v, e in zip(found.value, found.error, strict=True)]
     inner = partial(whole, 2)
     explained = float(inner[0, 1] ** 2 / max(inner[0, 0] * inner[1, 1], 1e-300))
-    zero, friction = (parts[2], parts[4]), (parts[3], parts[5])
-    axis = Axis(letter, k, parts[0], parts[1], zero, friction, explained, time)
+    zero, friction = (parts[2], parts[6]), (parts[3], parts[7])
+    others = (found.value[3:6] + found.value[7:10]) / 2
+    axis = Axis(letter, k, parts[0], parts[1], zero, friction, others, explained, time)
     return axis, np.add.reduceat(left**2, springs.edges)
 
 
@@ -172,15 +191,18 @@ def _nuisance(
     springs: Springs, letter: str, k: int, frame: str, axes: str
 ) -> list[Float[np.ndarray, " n"]]:
     """What else is in w: zero, friction, damping, lag; bias and weight where the arm turned; and
-    in a torque the force's about another point."""
-    away = displacements(springs, letter, axes)[:, k]
+    what a rotated sensor, or one that torques are about another point of, mixes in."""
+    away = displacements(springs, letter, axes)
     column = k + (3 if letter == "T" else 0)
-    rate = np.gradient(away, springs.log.times) if len(away) > 2 else np.zeros_like(away)
+    rate = np.gradient(away[:, k], springs.log.times)
     asked = springs.turned(springs.asked[:, :3] if column < 3 else springs.asked[:, 3:], axes)
-    found = [np.ones_like(away), _directions(springs, column, axes), rate, asked[:, k]]
+    found = [np.ones(len(away)), _directions(springs, column, axes), rate, asked[:, k]]
     if springs.spread > WIDE:
-        other = springs.frames[:, k] if axes == "world" else springs.frames[:, :, k]
-        found += list(other.T)
+        # A bias turns with the tool, a weight does not; about another point it turns both ways.
+        turn = springs.frames
+        rows = turn[:, k] if axes == "world" else turn[:, :, k]
+        found += list((rows if letter == "F" else turn.reshape(len(turn), 9)).T)
+    found += [away[:, j] for j in springs.axes(letter) if j != k]
     if letter == "T" and springs.axes("F"):
         force = readings(springs, "F", frame, axes)
         found += [force[:, j] for j in springs.axes("F") if j != k]
@@ -214,64 +236,3 @@ def choose_frames(springs: Springs) -> tuple[Parity, bool, bool]:
     rivals = [tried[other[best.frame], a] for a in frames]
     wrench = all(surer(rival) for rival in rivals)
     return best, wrench, all(surer(tried[f, other[best.axes]]) for f in frames)
-
-
-def sensor_turn(parity: Parity) -> Estimate | None:
-    """Rotation vector of the sensor's axes relative to the end effector's [rad], from forces that
-    are not along K e; None where K is not told in all axes.
-
-    F = f + rho x f with f = K e in axes of the end effector, where both factors of the cross
-    product hold K by fitting w to e, in which its error cancels.
-    """
-    springs = parity.springs
-    axes = [axis for axis in parity.told if axis.letter == "F" and axis.told]
-    if len(axes) < 3:
-        return None
-    slopes = np.array([float(axis.low.value) for axis in axes])
-    pushed = displacements(springs, "F", parity.axes) * slopes
-    into_tool = pushed if parity.axes == "tool" else springs.turned(pushed, "tool")
-    return _stacked(parity, "F", -skew(into_tool), 3)
-
-
-def sensor_point(parity: Parity) -> Estimate | None:
-    """Where the point that torques are about lies, from the end effector's origin, in its axes [m]:
-    T = T_0 - r x F; None where no torques, or not all forces, were recorded."""
-    springs = parity.springs
-    if len(springs.axes("F")) < 3 or len(springs.axes("T")) < 3:
-        return None
-    force = readings(springs, "F", parity.frame, "tool")
-    return _stacked(parity, "T", skew(force), 3)
-
-
-def _stacked(parity: Parity, letter: str, extra: Float[np.ndarray, "n 3 q"], count: int):
-    """Coefficients of `extra`, columns in axes of the end effector that all axes share, beside a
-    stiffness, zero, friction and damping of each axis."""
-    springs, axes = parity.springs, parity.axes
-    if axes == "world":
-        extra = np.einsum("nij,njq->niq", springs.frames, extra)
-    wrench = readings(springs, letter, parity.frame, axes)
-    own = [
-        np.column_stack(
-            (
-                displacements(springs, letter, axes)[:, k],
-                *_nuisance(springs, letter, k, parity.frame, axes)[
-                    : OWN + 1 if springs.spread > WIDE else OWN - 2
-                ],
-            )
-        )
-        for k in range(3)
-    ]
-    width = own[0].shape[1]
-    times = [axis.time for axis in parity.told if axis.letter == letter]
-    edges = block_edges(len(wrench), max(times, default=1.0))
-    sums = 0.0
-    for k in range(3):
-        columns = np.zeros((len(wrench), 1 + count + 3 * width))
-        columns[:, 0], columns[:, 1 : 1 + count] = wrench[:, k], extra[:, k]
-        columns[:, 1 + count + k * width : 1 + count + (k + 1) * width] = own[k]
-        sums = sums + moments(columns, edges)
-
-    def coefficients(products: np.ndarray) -> np.ndarray:
-        return solve(products[1:, 1:], products[1:, :1])[:count, 0]
-
-    return jackknife(coefficients, np.asarray(sums))

@@ -40,6 +40,12 @@ class Observed:
     force_axes: tuple[int, ...] = (0, 1, 2)
     """Which components were recorded."""
     torque_axes: tuple[int, ...] = (0, 1, 2)
+    pressed: Float[np.ndarray, "r 3"] | None = None
+    """Force of the world that is known besides, K (x - u), in axes of the end effector [N]."""
+    twisted: Float[np.ndarray, "r 3"] | None = None
+    """The same of the torque about the end effector's origin [N·m]."""
+    edges: Int[np.ndarray, " B"] | None = None
+    """Where blocks of time begin, if neighbours share errors: then blocks count, not samples."""
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -118,31 +124,20 @@ def observe_rests(log: Log, rests: list[tuple[int, int]], frame: str) -> Observe
     halves = [np.arange((a + b) // 2 if b - a > 1 else a, b) for a, b in rests]
     usable = log.usable
     groups = [half[usable[half]] for half in halves]
-    return observe(log, groups, frame, log.forces, log.torques).merged()
-
-
-def observe(
-    log: Log,
-    groups: list[Int[np.ndarray, " k"]],
-    frame: str,
-    forces: Float[np.ndarray, "n 3"],
-    torques: Float[np.ndarray, "n 3"],
-) -> Observed:
-    """Means of `forces` and `torques`, which are in axes of `frame`, over groups of samples."""
-    groups = [group for group in groups if len(group)]
     into_tool = log.rotations.inv()
-    up = into_tool.apply(UP)
-    if frame == "world":
-        forces, torques = into_tool.apply(forces), into_tool.apply(torques)
+    turned = frame == "world"
+    forces = into_tool.apply(log.forces) if turned else log.forces
+    torques = into_tool.apply(log.torques) if turned else log.torques
+    kept = [group for group in groups if len(group)]
 
     def means(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "r k"]:
-        return np.array([values[group].mean(0) for group in groups]).reshape(len(groups), -1)
+        return np.array([values[group].mean(0) for group in kept]).reshape(len(kept), -1)
 
     return Observed(
-        means(up),
+        means(into_tool.apply(UP)),
         means(forces),
         means(torques),
         means(log.times[:, None])[:, 0],
         recorded_axes(log, "F"),
         recorded_axes(log, "T"),
-    )
+    ).merged()

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
+from jaxtyping import Bool, Float, Int
 
 from tpcd.logs.log import AXES, Log
 from tpcd.quality.blocks import block_edges, correlation_time
@@ -19,8 +18,11 @@ from tpcd.quality.rests import recorded_axes
 
 MOST = 20_000
 """Samples that are looked at; more are thinned out evenly."""
-TURNED = 4.0
-"""Motion counts as a new direction once it goes back by so many standard deviations of noise."""
+OVER = 0.1
+"""Speed is taken over so long [s]."""
+NOISY, SLOW = 4.0, 0.01
+"""An arm moves where its speed is so many standard deviations of noise, and so much of its largest
+speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +62,34 @@ class Springs:
 
     @cached_property
     def directions(self) -> Float[np.ndarray, "n 6"]:
-        """Which way each of the arm's coordinates moved last: 1, -1, or 0 before it ever did."""
-        start = self.log.rotations[0]
-        turn = (self.log.rotations * start.inv()).as_rotvec()
-        moved = np.concatenate((self.log.positions, turn), axis=1)
-        return np.stack([_direction(column) for column in moved.T], axis=1)
+        """Which way friction of the arm holds each of its coordinates, in axes of the world: 1 or
+        -1 while it moves, and after that for as long as the command rests; else 0, for it may hold
+        either way."""
+        log, count = self.log, len(self.log)
+        span = min(max(1, round(OVER / 2 / self.step)), count // 3)
+        if span < 1:
+            return np.zeros((count, 6))
+        first = np.clip(np.arange(count) - span, 0, None)
+        last = np.clip(np.arange(count) + span, None, count - 1)
+        turn = (log.rotations[last] * log.rotations[first].inv()).as_rotvec()
+        moved = np.concatenate((log.positions[last] - log.positions[first], turn), axis=1)
+        speeds = moved / (log.times[last] - log.times[first])[:, None]
+        steps = (log.rotations[1:] * log.rotations[:-1].inv()).as_rotvec()
+        single = np.concatenate((np.diff(log.positions, axis=0), steps), axis=1)
+        # Second differences hold little motion: their median is 0.6745 sqrt(6) deviations.
+        noise = np.median(np.abs(np.diff(single, axis=0)), axis=0) / 1.65
+        least = NOISY * noise * 2**0.5 / (2 * span * self.step)
+        least = np.maximum(np.maximum(least, SLOW * np.abs(speeds).max(0)), 1e-12)
+        return np.where(self._held(speeds, least), _latest(speeds, least), 0.0)
+
+    def _held(
+        self, speeds: Float[np.ndarray, "n 6"], least: Float[np.ndarray, " 6"]
+    ) -> Bool[np.ndarray, "n 6"]:
+        """Where a coordinate moves, or its command has rested since it did."""
+        order = np.arange(len(speeds))[:, None]
+        moved = np.maximum.accumulate(np.where(np.abs(speeds) > least, order, -1))
+        asked = np.maximum.accumulate(np.where(np.abs(self.asked) > least, order, -1))
+        return (moved >= 0) & ((moved == order) | (asked <= moved))
 
     @property
     def step(self) -> float:
@@ -112,19 +137,10 @@ def springs(log: Log) -> Springs | None:
     return Springs(log.only(mask), every)
 
 
-def _direction(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    steps = np.abs(np.diff(values))
-    moving = steps[steps > 0]
-    # A tenth of the steps are between samples at rest, where there are any.
-    noise = float(np.quantile(moving, 0.1)) if len(moving) else 0.0
-    reach = max(TURNED * noise, 1e-3 * float(np.ptp(values)))
-    told, way, extreme = np.zeros(len(values)), 0.0, values[0]
-    for k, value in enumerate(values):
-        if way >= 0 and value < extreme - reach:
-            way, extreme = -1.0, value
-        elif way <= 0 and value > extreme + reach:
-            way, extreme = 1.0, value
-        elif (value - extreme) * way > 0:
-            extreme = value
-        told[k] = way
-    return told
+def _latest(
+    speeds: Float[np.ndarray, "n 6"], least: Float[np.ndarray, " 6"]
+) -> Float[np.ndarray, "n 6"]:
+    """Sign of the last motion that was faster than `least`."""
+    order = np.arange(len(speeds))[:, None]
+    moved = np.maximum.accumulate(np.where(np.abs(speeds) > least, order, -1))
+    return np.sign(np.take_along_axis(speeds, np.maximum(moved, 0), axis=0))

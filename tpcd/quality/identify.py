@@ -31,11 +31,16 @@ def identify(log: Log, stiffness: Sequence[float] | None = None) -> tuple[Quanti
     why `log` does not tell it.
 
     `stiffness` is what the controller was given, along and about x, y, z
-    [N/m, N/m, N/m, N·m/rad, N·m/rad, N·m/rad]; the gain of the sensor needs it. Samples that
-    findings leave out are not used.
+    [N/m, N/m, N/m, N·m/rad, N·m/rad, N·m/rad], or in x, z and phi of a plane; the gain of the
+    sensor needs it. Samples that findings leave out are not used.
     """
+    if stiffness is not None and len(stiffness) == 3:
+        x, z, phi = stiffness
+        stiffness = (x, np.nan, z, np.nan, phi, np.nan)
     if stiffness is not None and len(stiffness) != 6:
-        raise ValueError(f"stiffness has {len(stiffness)} numbers, expected six")
+        raise ValueError(
+            f"stiffness has {len(stiffness)} numbers, expected six (or three: x, z, phi)"
+        )
     sampled = springs(log)
     if sampled is None:
         return (*_from_rests(log), *_without_commands())
@@ -72,7 +77,9 @@ def _from_parity(parity: Parity, stiffness: Sequence[float] | None) -> tuple[Qua
     found = parity.stiffness()
     known = found[0] != 0
     if stiffness is not None:
-        found, known = (parity.sign * np.array(stiffness, dtype=float),), np.ones(6, dtype=bool)
+        given = np.array(stiffness, dtype=float)
+        known = np.isfinite(given) | known
+        found = tuple(np.where(np.isfinite(given), parity.sign * given, each) for each in found)
     tables = []
     for each in found:
         seen = _beside_springs(parity, each, bool(known[3:].all()))

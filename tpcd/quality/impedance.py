@@ -102,7 +102,7 @@ def _stiffness(parity: Parity, k: int) -> Quantity:
 
 def _gain(parity: Parity, k: int, stiffness: Sequence[float] | None) -> Quantity:
     name, motion = f"gain_{NAMES[k]}", PRESS if k < 3 else TWIST
-    if stiffness is None:
+    if stiffness is None or not np.isfinite(stiffness[k]):
         reason = "gain and stiffness are known by their product only, and no stiffness was given"
         return Quantity(name, "", reason=reason, motion="give the controller's stiffness")
     found = _stiffness(parity, k)

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from tpcd.quality.blocks import block_edges, correlation_time, jackknife
 from tpcd.quality.parity import Parity, displacements, readings
 from tpcd.quality.quantity import Quantity
-from tpcd.quality.rests import SHORTEST
 from tpcd.quality.springs import Springs
 
 LONGEST = 0.5
@@ -100,7 +99,7 @@ def wrench_lag(parity: Parity) -> Quantity:
 
 
 def _sparse(springs: Springs) -> str:
-    if springs.step >= SHORTEST:
+    if springs.sparse:
         return "rows were read one by one, at rest"
     if len(springs.log) < 100:
         return f"there are {len(springs.log)} samples only"

@@ -194,7 +194,7 @@ def _nuisance(
     what a rotated sensor, or one that torques are about another point of, mixes in."""
     away = displacements(springs, letter, axes)
     column = k + (3 if letter == "T" else 0)
-    rate = np.gradient(away[:, k], springs.log.times)
+    rate = springs.rates(away[:, k : k + 1])[:, 0]
     asked = springs.turned(springs.asked[:, :3] if column < 3 else springs.asked[:, 3:], axes)
     found = [np.ones(len(away)), _directions(springs, column, axes), rate, asked[:, k]]
     if springs.spread > WIDE:

@@ -4,11 +4,12 @@ In axes of the end effector the sensor reads
 
     F = b_F + S (f + W up),    T = b_T + S t + r x' (S f) + c x (W S up),
 
-where up is against gravity, W < 0 the load's weight, and f, t what the world is known to press with,
-about the end effector's origin: nothing in the air, K (x - u) under an impedance controller. S turns
-axes of the end effector into the sensor's; r is the point that torques are about, from the origin,
-and c the load's centre of mass from that point, both in the sensor's axes (r x' F is F x r). Linear
-in b_F, W, and a small rotation beyond what is known of S; then in b_T, c and r.
+where up is against gravity, W < 0 the load's weight, and f, t what the world is known to press
+with, about the end effector's origin: nothing in the air, K (x - u) under an impedance controller.
+S turns axes of the end effector into the sensor's; r is the point that torques are about, from the
+origin, and c the load's centre of mass from that point, both in the sensor's axes (r x' F is
+F x r). Linear in b_F, W, and a small rotation beyond what is known of S; then in b_T, c and r. A
+wrench that is recorded with the other sign has all of them with the other sign but S, r and c.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ WORST = 1e10
 """Condition of the normal equations beyond which a combination of parameters has no effect."""
 TURNS = 20
 """Rounds in which a large rotation of the sensor is approached."""
-USELESS = 1.0
-"""An interval of weight that is wider, either way, than this part of it and of a newton tells
-nothing."""
+USELESS = {"N": 1.0, "N·m": 0.1}
+"""An interval that is wider, either way, than the value, and the weight, and this tells nothing."""
 PLANAR = "readings are planar"
 HANGING = "what hangs on the sensor shows its centre of mass from that point, and not the point"
+WEIGHTLESS = "the load's weight is not told apart from none"
+TWISTED = "torques scatter too much beside what is pressed"
 LOADS = "press along two directions that are not parallel, each at two loads, under the springs"
 ORIENTATIONS = (
     "rest 10 s without contact in six orientations, so that each of the sensor's axes points up"
@@ -142,7 +144,7 @@ def _load(seen: Observed, kept: Int[np.ndarray, " k"]) -> Load | None:
     axes = list(seen.force_axes)
     forces, at = seen.forces[kept][:, axes], len(axes)
     pressed = np.zeros((len(kept), 3)) if seen.pressed is None else seen.pressed[kept]
-    plain = _fitted(seen, kept, Rotation.identity(), None)
+    plain = _fitted(seen, kept, Rotation.identity(), None, seen.edges)
     weight = 0.0 if plain is None else float(plain.value[at])
     known = Rotation.identity()
     if at == 3 and seen.pressed is None:
@@ -150,11 +152,14 @@ def _load(seen: Observed, kept: Int[np.ndarray, " k"]) -> Load | None:
     for _ in range(TURNS):
         if not weight and not pressed.any():
             break
-        linear = _fitted(seen, kept, known, weight or 1e-9)
+        linear = _fitted(seen, kept, known, weight or 1e-9, None)
         if linear is None:
             break
         rest, weight = _turn(linear.value, axes), float(linear.value[at])
         if np.linalg.norm(rest) < 1e-9:
+            linear = _fitted(seen, kept, known, weight, seen.edges)
+            if linear is None:
+                break
             wide = [linear.half_width(row) for row in np.eye(len(linear.value))[at + 1 :]]
             if max(wide) > ALIGNED:
                 break
@@ -166,17 +171,20 @@ def _load(seen: Observed, kept: Int[np.ndarray, " k"]) -> Load | None:
 
 
 def _fitted(
-    seen: Observed, kept: Int[np.ndarray, " k"], known: Rotation, weight: float | None
+    seen: Observed,
+    kept: Int[np.ndarray, " k"],
+    known: Rotation,
+    weight: float | None,
+    edges: Int[np.ndarray, " B"] | None,
 ) -> Linear | None:
-    axes = list(seen.force_axes)
     design, target = _equations(seen, kept, known, weight)
-    return fit(design, target[:, axes], seen.edges)
+    return fit(design, target[:, list(seen.force_axes)], edges)
 
 
 def _equations(
     seen: Observed, kept: Int[np.ndarray, " k"], known: Rotation, weight: float | None
 ) -> tuple[Float[np.ndarray, "r k p"], Float[np.ndarray, "r 3"]]:
-    """Columns of b_F, W and, unless `weight` is None, the remaining rotation; and what they make."""
+    """Columns of b_F, W and, unless `weight` is None, the remaining rotation; what they make."""
     axes = list(seen.force_axes)
     up, target = known.apply(seen.up[kept]), seen.forces[kept]
     parts = [np.broadcast_to(np.eye(3), (len(up), 3, 3))[:, :, axes], up[:, :, None]]
@@ -291,7 +299,7 @@ def _forces(seen: Observed, found: Load, basis: str) -> tuple[Quantity, ...]:
     aligned = "" if found.turned else ", its axes taken as the end effector's"
     known = f"{basis}{aligned}; times the sensor's gain, which a known weight would show"
     told = [_bounded("weight", "N", weight, wide, known)]
-    if wide > USELESS * max(abs(weight), 1.0):
+    if wide > max(abs(weight), USELESS["N"]):
         told = [Quantity("weight", "N", reason=reason, motion=ORIENTATIONS)]
     for k, axis in enumerate(AXES):
         name = f"force_bias_{axis}"
@@ -299,7 +307,7 @@ def _forces(seen: Observed, found: Load, basis: str) -> tuple[Quantity, ...]:
             told += untold((name,), "N", f"F_{axis} was not recorded", "record it")
             continue
         value, half = float(linear.value[axes.index(k)]), linear.half_width(unit[axes.index(k)])
-        if half > USELESS * max(abs(weight), abs(value), 1.0):
+        if half > max(abs(weight), abs(value), USELESS["N"]):
             told += untold((name,), "N", reason, ORIENTATIONS)
         else:
             told.append(_bounded(name, "N", value, half, basis))
@@ -333,6 +341,10 @@ def _torques(seen: Observed, found: Load, weight: Quantity) -> tuple[Quantity, .
         parts.append(skew(found.rotation.apply(seen.pressed[found.kept])))
         torques = torques - found.rotation.apply(seen.twisted[found.kept])
     design = np.concatenate(parts, axis=2)[:, axes]
+    loaded = weight.interval is not None and weight.interval[0] * weight.interval[1] > 0
+    if weight.told and not loaded:
+        # No load, no moment.
+        design[..., 3:6] = 0.0
     # In a planar recording the parts out of the plane turn nothing.
     free = [k for k in range(design.shape[2]) if axes and np.abs(design[..., k]).max() > 0]
     linear = fit(design[..., free], torques[:, axes], seen.edges) if free else None
@@ -347,14 +359,19 @@ def _torques(seen: Observed, found: Load, weight: Quantity) -> tuple[Quantity, .
             )
         elif k >= 6 and len(parts) < 3:
             told.append(Quantity(name, unit, reason=HANGING, motion=LOADS))
+        elif weight.told and not loaded and 3 <= k < 6:
+            told.append(Quantity(name, unit, reason=WEIGHTLESS, motion=ORIENTATIONS))
         elif k not in free:
             told.append(Quantity(name, unit, reason=PLANAR, motion="record all components"))
-        elif linear is None or (3 <= k < 6 and not weight.told):
+        elif linear is None or not weight.told:
             reason = f"orientations differ by {_spread(seen):.2g} degrees only"
             told.append(Quantity(name, unit, reason=reason, motion=ORIENTATIONS))
         else:
             at = free.index(k)
             value, half = float(linear.value[at]), linear.half_width(np.eye(len(free))[at])
+            if k < 3 and half > max(abs(value), USELESS[unit]):
+                told.append(Quantity(name, unit, reason=TWISTED, motion=ORIENTATIONS))
+                continue
             basis = f"left {linear.scatter:.2g} N·m"
             if 3 <= k < 6:
                 half = float(np.hypot(half, relative * value))

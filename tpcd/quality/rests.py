@@ -76,9 +76,15 @@ class Observed:
 def recorded_axes(log: Log, letter: str) -> tuple[int, ...]:
     """Which components of F or T (`letter`) hold readings, with axes of the tool or the world.
 
-    Components that are missing and would mix with others as the arm turns leave none.
+    One that never changes holds none. Where missing ones would mix with others as the arm turns,
+    none is left.
     """
-    kept = tuple(k for k, axis in enumerate(AXES) if f"{letter}_{axis}" not in log.missing)
+    values = log.forces if letter == "F" else log.torques
+    kept = tuple(
+        k
+        for k, axis in enumerate(AXES)
+        if f"{letter}_{axis}" not in log.missing and np.ptp(values[:, k]) > 0
+    )
     if len(kept) in (0, 3):
         return kept
     if letter == "F" and len(kept) < 2:
@@ -98,6 +104,8 @@ def find_rests(log: Log) -> list[tuple[int, int]]:
     bins = np.floor((log.times - log.times[0]) / BIN).astype(int)
     bins[~log.usable] = -1
     present, first = np.unique(bins[kept], return_index=True)
+    if len(present) < 2:
+        return []
     edges = np.append(first, len(kept))
     counts = np.diff(edges)
     places = np.add.reduceat(log.positions[kept], first, axis=0) / counts[:, None]
@@ -131,7 +139,7 @@ def observe_rests(log: Log, rests: list[tuple[int, int]], frame: str) -> Observe
     kept = [group for group in groups if len(group)]
 
     def means(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "r k"]:
-        return np.array([values[group].mean(0) for group in kept]).reshape(len(kept), -1)
+        return np.array([values[group].mean(0) for group in kept]).reshape(-1, values.shape[1])
 
     return Observed(
         means(into_tool.apply(UP)),

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from tpcd.logs.log import AXES, Log
 from tpcd.quality.blocks import block_edges, correlation_time
-from tpcd.quality.rests import recorded_axes
+from tpcd.quality.rests import SHORTEST, recorded_axes
 
 MOST = 20_000
 """Samples that are looked at; more are thinned out evenly."""
@@ -48,12 +48,24 @@ class Springs:
         turn = (log.rotations * turned.inv()).as_rotvec()
         return np.concatenate((log.positions - log.command_positions, turn), axis=1)
 
+    @property
+    def sparse(self) -> bool:
+        """Whether rows were read one by one, at rest: what moves does so between them."""
+        return self.step >= SHORTEST
+
+    def rates(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        """How fast columns change; of rows read at rest, since the row before."""
+        if not self.sparse:
+            return np.gradient(values, self.log.times, axis=0)
+        steps = np.diff(values, axis=0) / np.diff(self.log.times)[:, None]
+        return np.concatenate((np.zeros_like(steps[:1]), steps))
+
     @cached_property
     def asked(self) -> Float[np.ndarray, "n 6"]:
         """Velocity of the command, in axes of the world [m/s, rad/s]."""
         log = self.log
         assert log.command_positions is not None
-        linear = np.gradient(log.command_positions, log.times, axis=0)
+        linear = self.rates(log.command_positions)
         angular = np.zeros_like(linear)
         if log.command_rotations is not None:
             turn = log.command_rotations[1:] * log.command_rotations[:-1].inv()
@@ -70,10 +82,10 @@ class Springs:
         if span < 1:
             return np.zeros((count, 6))
         first = np.clip(np.arange(count) - span, 0, None)
-        last = np.clip(np.arange(count) + span, None, count - 1)
+        last = np.clip(np.arange(count) + (0 if self.sparse else span), None, count - 1)
         turn = (log.rotations[last] * log.rotations[first].inv()).as_rotvec()
         moved = np.concatenate((log.positions[last] - log.positions[first], turn), axis=1)
-        speeds = moved / (log.times[last] - log.times[first])[:, None]
+        speeds = moved / np.maximum(log.times[last] - log.times[first], 1e-12)[:, None]
         steps = (log.rotations[1:] * log.rotations[:-1].inv()).as_rotvec()
         single = np.concatenate((np.diff(log.positions, axis=0), steps), axis=1)
         # Second differences hold little motion: their median is 0.6745 sqrt(6) deviations.

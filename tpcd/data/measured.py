@@ -52,7 +52,10 @@ class Measured:
             f" {np.degrees(span[2]):.2g} degrees under {load.min():.3g} to {load.max():.3g} N"
         )
         if load.min() > load.max() / 2 > 0:
-            words += ": one contact held throughout, none made, broken or slid"
+            words += (
+                ": one contact held throughout, or nothing but the load and the zero of the sensor;"
+                " none made, broken or slid"
+            )
         return words
 
 

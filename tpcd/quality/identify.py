@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from tpcd.logs.log import Log
 from tpcd.quality.blocks import block_edges, correlation_time
-from tpcd.quality.impedance import NAMES, PRESS, impedance
+from tpcd.quality.impedance import NAMES, PRESS, computed, impedance
 from tpcd.quality.parity import Parity, spring_wrench
 from tpcd.quality.payload import ORIENTATIONS, payload, weigh
 from tpcd.quality.quantity import Quantity, untold
@@ -45,6 +45,8 @@ def identify(log: Log, stiffness: Sequence[float] | None = None) -> tuple[Quanti
     if sampled is None:
         return (*_from_rests(log), *_without_commands())
     parity, told = impedance(sampled, stiffness)
+    if computed(parity):
+        return told
     load = _from_parity(parity, stiffness)
     return (*told, *load)
 

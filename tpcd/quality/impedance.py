@@ -13,10 +13,15 @@ import numpy as np
 from tpcd.quality.blocks import Estimate
 from tpcd.quality.lags import pose_lag, wrench_lag
 from tpcd.quality.parity import Axis, Parity, choose_frames
-from tpcd.quality.quantity import Quantity
+from tpcd.quality.quantity import Quantity, untold
 from tpcd.quality.springs import Springs
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
+UNITS = ("N", "N·m")
+EXACT = 1e-9
+"""A part of the wrench's variance that no sensor's noise is below; written digits are."""
+WIDEST = 10.0
+"""Ends of a stiffness that are further apart, in ratio, tell nothing."""
 CLOSE = 1.5
 """Ends of a stiffness that are further apart, in ratio, leave more to be done."""
 PRESS = "press along the axis at three loads, both ways, the largest ten times what friction holds"
@@ -29,6 +34,8 @@ def impedance(
 ) -> tuple[Parity, tuple[Quantity, ...]]:
     """The parity fit in the frames that fit best, and what it tells."""
     parity, frame_told, axes_told = choose_frames(springs)
+    if computed(parity):
+        return parity, _computed(parity)
     told = [*_frames(parity, frame_told, axes_told), _sign(parity)]
     told += [_stiffness(parity, k) for k in range(6)]
     told += [_gain(parity, k, stiffness) for k in range(6)]
@@ -36,6 +43,32 @@ def impedance(
     told += [_between(parity, k, "friction") for k in range(6)]
     told += [pose_lag(parity), wrench_lag(parity)]
     return parity, tuple(told)
+
+
+def computed(parity: Parity) -> bool:
+    """Whether the wrench is K (x - u) to the last digits in every axis: no sensor reads so."""
+    return bool(parity.told) and all(axis.explained > 1 - EXACT for axis in parity.told)
+
+
+def _computed(parity: Parity) -> tuple[Quantity, ...]:
+    """What a wrench tells that was computed from the pose: the stiffness that it was computed with,
+    and nothing of sensor or friction."""
+    basis = "w is K (x - u) to the last digits, so no sensor's noise is in it"
+    told = [Quantity("wrench_source", "", "computed from x - u, not measured", basis=basis)]
+    for k, axis in enumerate(NAMES):
+        found = _axis(parity, k)
+        unit = "N/m" if k < 3 else "N·m/rad"
+        if found is None:
+            told.append(Quantity(f"stiffness_{axis}", unit, reason=_missing(parity, k)))
+        else:
+            value = float(found.low.value)
+            told.append(Quantity(f"stiffness_{axis}", unit, value, basis="what w was made with"))
+    reason, motion = "the wrench was computed from x - u", "record a force sensor beside it"
+    for kind, units in (("gain", ("", "")), ("parity_zero", UNITS), ("arm_friction", UNITS)):
+        for k, axis in enumerate(NAMES):
+            told += untold((f"{kind}_{axis}",), units[k // 3], reason, motion)
+    told += [pose_lag(parity), *untold(("wrench_lag",), "s", reason, motion)]
+    return tuple(told)
 
 
 def _frames(parity: Parity, frame: bool, axes: bool) -> list[Quantity]:
@@ -92,6 +125,8 @@ def _stiffness(parity: Parity, k: int) -> Quantity:
         return Quantity(name, unit, reason=_unexplained(axis), motion=motion)
     sign = np.sign(float(axis.low.value))
     low, high = sorted(float(sign * end) for end in axis.interval)
+    if high > WIDEST * low:
+        return Quantity(name, unit, reason=_unexplained(axis), motion=motion)
     basis = (
         f"w against x - u in {parity.axes} axes, which explains {axis.explained:.0%}; times the"
         " sensor's gain, which these data cannot tell apart"
@@ -122,7 +157,7 @@ def _between(parity: Parity, k: int, kind: str) -> Quantity:
     motion, axis = PRESS if k < 3 else TWIST, _axis(parity, k)
     if axis is None:
         return Quantity(name, unit, reason=_missing(parity, k), motion=motion)
-    if not axis.told:
+    if not _stiffness(parity, k).told:
         return Quantity(name, unit, reason=_unexplained(axis), motion=motion)
     ends: tuple[Estimate, Estimate] = axis.zero if kind == "zero" else axis.friction
     bounds = [float(v) for end in ends for v in end.bounds()]

@@ -43,6 +43,7 @@ PLANAR = "readings are planar"
 HANGING = "what hangs on the sensor shows its centre of mass from that point, and not the point"
 WEIGHTLESS = "the load's weight is not told apart from none"
 TWISTED = "torques scatter too much beside what is pressed"
+LEVERS = "a lever of the contact looks the same while no stiffness about the axes is told"
 LOADS = "press along two directions that are not parallel, each at two loads, under the springs"
 ORIENTATIONS = (
     "rest 10 s without contact in six orientations, so that each of the sensor's axes points up"
@@ -358,7 +359,8 @@ def _torques(seen: Observed, found: Load, weight: Quantity) -> tuple[Quantity, .
                 Quantity(name, unit, reason="torques were not recorded", motion="record them")
             )
         elif k >= 6 and len(parts) < 3:
-            told.append(Quantity(name, unit, reason=HANGING, motion=LOADS))
+            reason = HANGING if seen.pressed is None else LEVERS
+            told.append(Quantity(name, unit, reason=reason, motion=LOADS))
         elif weight.told and not loaded and 3 <= k < 6:
             told.append(Quantity(name, unit, reason=WEIGHTLESS, motion=ORIENTATIONS))
         elif k not in free:

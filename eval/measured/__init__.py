@@ -1,0 +1,1 @@
+"""Real recordings of other people through check, identification, import, estimate and diagnosis."""

@@ -1,0 +1,168 @@
+"""Real recordings through the commands, and what arm and sensor of each are found to be.
+
+The sets are other people's and stay where they are; `TPCD_MEASURED` names their folder. What is
+written are figures: `results.json`, and README.md made of it.
+
+TPCD_MEASURED=FOLDER python -m eval.measured --out runs/measured
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tpcd.cli import run
+
+if TYPE_CHECKING:
+    from eval.measured.pivoting import Held
+    from eval.measured.sets import Recording
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Settings of the command."""
+
+    out: Path = Path("runs/measured")
+    """Folder for the results."""
+    prior: str = "ycb-rich"
+    """Shape prior of estimate and diagnosis."""
+    seed: int = 0
+    """Seed of estimate and diagnosis."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+
+
+def evaluate_measured(config: Measurements) -> None:
+    """Check, identify and import every recording; estimate and diagnose the episode in a plane."""
+    from eval.measured.page import write_page
+    from eval.measured.pivoting import read_held
+    from eval.measured.sets import FOLDER_VARIABLE, measured_folder, recordings
+    from tpcd.errors import FileError
+    from tpcd.results import open_run, write_results
+
+    folder = measured_folder()
+    if folder is None:
+        raise FileError(
+            Path(FOLDER_VARIABLE), "is not set", "set it to the folder of the measured sets"
+        )
+    out = open_run(config.out, "python -m eval.measured", config, config.overwrite)
+    found: list[dict[str, Any]] = []
+    for recording in recordings(folder, out / "tables"):
+        print(recording.name, flush=True)
+        found.append(_measured(recording, out))
+    held = [read_held(p) for p in sorted((folder / "pbal_impedance").glob("*Stiffness*.json"))]
+    print("pbal", flush=True)
+    found.append(_pivoted(held, config, out))
+    write_results(out, [], recordings=found, seeds=[config.seed])
+    write_page(out / "results.json", out / "README.md")
+    print(f"page in {out / 'README.md'}")
+
+
+def _measured(recording: Recording, out: Path) -> dict[str, Any]:
+    from tpcd.quality.identify import identify
+
+    log = recording.read()
+    told = [asdict(each) for each in identify(log)]
+    commands = _commands(recording, out)
+    known = [
+        {"name": name, "known": value, **_holds(told, name, value)}
+        for name, value in recording.known.items()
+    ]
+    about = {"name": recording.name, "set": recording.set, "samples": len(log)}
+    return {**about, "commands": commands, "told": told, "known": known}
+
+
+def _holds(told: Sequence[dict[str, Any]], name: str, value: float) -> dict[str, Any]:
+    found = next(each for each in told if each["name"] == name)
+    interval = found["interval"]
+    return {**found, "holds": interval is not None and interval[0] <= value <= interval[1]}
+
+
+def _commands(recording: Recording, out: Path) -> list[dict[str, Any]]:
+    name = recording.table.stem
+    stiffness = [f"{k:g}" for k in recording.stiffness]
+    imported = ["--stiffness", *stiffness, *recording.more, "--out", str(out / f"import-{name}")]
+    return [
+        _said("check", [*recording.arguments(), "--out", str(out / f"check-{name}")], out),
+        _said("import_log", [*recording.arguments(), *imported], out),
+    ]
+
+
+def _said(script: str, arguments: Sequence[str], out: Path) -> dict[str, Any]:
+    """Exit code and lines of a command, without places of this machine."""
+    command = [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    lines = []
+    for stream in (done.stdout, done.stderr):
+        for line in stream.splitlines():
+            # A bar of progress writes over itself.
+            last = line.rsplit("\r", 1)[-1].strip()
+            if last and "step/s" not in last:
+                lines.append(_placeless(last, [out, *map(Path, arguments)]))
+    return {"command": f"scripts/{script}.py", "code": done.returncode, "said": lines}
+
+
+def _placeless(line: str, places: Sequence[Path]) -> str:
+    for place in places:
+        if place.is_absolute() or len(place.parts) > 1:
+            line = line.replace(f"{place.parent}/", "")
+    return line
+
+
+def _pivoted(held: Sequence[Held], config: Measurements, out: Path) -> dict[str, Any]:
+    from eval.measured.pivoting import episode, joined
+    from eval.measured.sets import Recording, write_table
+    from tpcd.data.files import episode_contents, write_together
+    from tpcd.quality.identify import identify
+
+    columns = joined(held)
+    table = write_table(out / "tables" / "pbal.csv", columns)
+    entries = tuple(f"{name}={name}" for name in columns)
+    stiffness = tuple(float(k) for k in held[0].stiffness)
+    recording = Recording("pbal", "pbal_impedance", table, entries, stiffness=stiffness)
+    log = recording.read()
+    commands = _commands(recording, out)
+    stem = out / "pbal" / "episode"
+    stem.parent.mkdir()
+    contents = episode_contents(episode(held), stem)
+    write_together({path: data for path, data in contents.items() if data is not None})
+    given = [str(stem.parent), "--prior", config.prior, "--seed", str(config.seed)]
+    for script in ("estimate", "diagnose"):
+        commands.append(_said(script, [*given, "--out", str(out / f"pbal-{script}")], out))
+    about = {"name": "pbal", "set": "pbal_impedance", "samples": len(log)}
+    told = [asdict(each) for each in identify(log)]
+    return {**about, "commands": commands, "told": told, "known": [], "balance": balance(held)}
+
+
+def balance(held: Sequence[Held]) -> dict[str, Any]:
+    """What is left of the moments about the pivot [N·m], by the side from which the palm came, with
+    the geometry and with its mirror images: friction that the arm stops against is the same from
+    hold to hold, a wrong geometry is not."""
+    sides = np.array([np.sign(one.contact[0, 2]) for one in held])
+    found = {}
+    for name, mirror in (
+        ("as derived", (1.0, 1.0)),
+        ("theta mirrored", (-1.0, 1.0)),
+        ("s mirrored", (1.0, -1.0)),
+        ("both mirrored", (-1.0, -1.0)),
+    ):
+        left = np.array([one.moment_left(mirror) for one in held])
+        parts = {word: left[sides == side] for word, side in (("below", -1.0), ("above", 1.0))}
+        found[name] = {
+            "scatter": float(np.sqrt(np.mean([part.var(ddof=1) for part in parts.values()]))),
+            **{word: float(part.mean()) for word, part in parts.items()},
+            **{f"{word}_holds": len(part) for word, part in parts.items()},
+        }
+    return found
+
+
+if __name__ == "__main__":
+    run(evaluate_measured, Measurements)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
+
+from tpcd.cli import check_numbers
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,10 @@ class DataConfig:
     """If not empty, train on these names alone."""
 
     def __post_init__(self) -> None:
-        _require(self, 0, "smallest_size", "builtin_variants")
-        _require(self, self.smallest_size, "largest_size")
+        check_numbers(self, {"smallest_size": 0, "builtin_variants": 0})
+        check_numbers(self, {"largest_size": self.smallest_size})
+        if any(not name for name in (*self.leave_out, *self.only)):
+            raise ValueError("leave_out or only holds an empty name, expected names of outlines")
 
 
 @dataclass(frozen=True)
@@ -61,10 +65,11 @@ class LayoutConfig:
     """Standard deviation of the points further from the outline [m]."""
 
     def __post_init__(self) -> None:
-        _require(self, 8, "points")
-        _require(self, 1, "attempts", "neighbours", "components", "between")
-        _require(self, 10, "object_samples")
-        _require(self, 0, "rounding", "turning_share", "jitter", "near_spread", "far_spread")
+        least = {"points": 8, "attempts": 1, "neighbours": 2, "components": 1, "between": 1}
+        least |= {"object_samples": 10, "rounding": 0, "turning_share": 0, "jitter": 0}
+        check_numbers(self, {**least, "near_spread": 0, "far_spread": 0})
+        _check_most(self, points=4096, attempts=10_000, components=10_000, between=10_000_000)
+        _check_most(self, object_samples=1_000_000, rounding=0.1, near_spread=1.0, far_spread=1.0)
         if self.turning_share > 1 or not 0 < self.extent <= 1:
             raise ValueError(
                 f"turning_share is {self.turning_share} and extent {self.extent}, "
@@ -86,9 +91,8 @@ class NetworkConfig:
     """Largest initial first-layer weight on a latent entry."""
 
     def __post_init__(self) -> None:
-        _require(self, 2, "latent_dim")
-        _require(self, 1, "width", "depth")
-        _require(self, 0, "frequency")
+        check_numbers(self, {"latent_dim": 2, "width": 1, "depth": 1, "frequency": 0})
+        _check_most(self, width=16_384, depth=64, frequency=1000.0)
 
 
 @dataclass(frozen=True)
@@ -121,9 +125,13 @@ class OptimConfig:
     """Torch threads."""
 
     def __post_init__(self) -> None:
-        _require(self, 1, "steps", "batch", "latents", "threads")
-        _require(self, 0, "adam_rate", "muon_rate", "code_rate")
-        _require(self, 0, "distance_weight", "support_weight", "outline_weight")
+        least = {"steps": 1, "batch": 1, "latents": 1, "threads": 1}
+        rates = {"adam_rate": 0, "muon_rate": 0, "code_rate": 0}
+        weights = {"distance_weight": 0, "support_weight": 0, "outline_weight": 0}
+        check_numbers(self, {**least, **rates, **weights})
+        _check_most(self, steps=100_000_000, batch=10_000_000, latents=1_000_000, threads=1024)
+        if self.distance_weight == self.support_weight == self.outline_weight == 0:
+            raise ValueError(f"{' and '.join(weights)} are 0, expected one of them above")
 
 
 @dataclass(frozen=True)
@@ -140,8 +148,8 @@ class CheckConfig:
     """Fit the YCB objects that were not trained on, where their outlines are to be had."""
 
     def __post_init__(self) -> None:
-        _require(self, 1, "mask_cells", "floor_draws")
-        _require(self, 4, "draws")
+        check_numbers(self, {"mask_cells": 1, "floor_draws": 1, "draws": 4})
+        _check_most(self, mask_cells=1024, floor_draws=1_000_000, draws=1_000_000)
 
 
 @dataclass(frozen=True)
@@ -163,8 +171,17 @@ class TrainingConfig:
     check: CheckConfig = field(default_factory=CheckConfig)
     """How the result is checked."""
 
+    def __post_init__(self) -> None:
+        needed = 2 * self.layout.components
+        if self.network.latent_dim > 2 and self.layout.between < needed:
+            raise ValueError(
+                f"layout.between is {self.layout.between}, expected at least {needed}: half of "
+                "them, one for each of layout.components"
+            )
 
-def _require(config: Any, least: float, *names: str) -> None:
-    for name in names:
-        if not getattr(config, name) >= least:
-            raise ValueError(f"{name} is {getattr(config, name)}, expected at least {least}")
+
+def _check_most(config: object, **most: float) -> None:
+    """Refuse numbers by which the work would not fit into a machine, or that are a slip."""
+    for name, limit in most.items():
+        if getattr(config, name) > limit:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected at most {limit}")

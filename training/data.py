@@ -1,6 +1,6 @@
-"""Lightning's data side: outlines in correspondence, latents in between, and batches.
+"""The data of a training: outlines in correspondence, latents in between, and batches.
 
-`prepare` computes once what does not change during training; `PriorData` serves random
+`prepare` computes once what does not change during training; `Batches` serves random
 batches of it. Lengths are in the networks' unit here.
 """
 
@@ -14,9 +14,7 @@ import numpy as np
 import shapely
 import torch
 from jaxtyping import Float, Float64, Int
-from lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
 
 from tpcd.shape.deepsdf import UNIT
 from training.config import TrainingConfig
@@ -117,6 +115,8 @@ def with_as_many_vertices(
 class Batch(NamedTuple):
     """Random draws of one step."""
 
+    step: int
+    """Which step of the training they are for, from 0."""
     outline: Int[Tensor, " s"]
     """Outlines of the distances."""
     sample: Int[Tensor, " s"]
@@ -127,38 +127,32 @@ class Batch(NamedTuple):
     """Directions of the support functions [rad]."""
 
 
-class _Draws(IterableDataset):
-    """Random batches; the same ones again where a run is resumed."""
+class Batches:
+    """The random batches of a training from step `first` on, to the last of `optim.steps`.
 
-    def __init__(self, prepared: Prepared, config: TrainingConfig) -> None:
-        self.prepared, self.config = prepared, config
+    They follow from the configuration alone, so a resumed training sees what it would have seen.
+    """
+
+    def __init__(self, prepared: Prepared, config: TrainingConfig, first: int = 0) -> None:
+        self.prepared, self.config, self.first = prepared, config, first
 
     def __len__(self) -> int:
-        return self.config.optim.steps
+        return self.config.optim.steps - self.first
 
     def __iter__(self) -> Iterator[Batch]:
         data, optim = self.prepared, self.config.optim
         generator = torch.Generator().manual_seed(optim.seed + 1)
         outlines, samples = data.samples.distance.shape
-        for _ in range(len(self)):
-            yield Batch(
+        for step in range(optim.steps):
+            batch = Batch(
+                step,
                 torch.randint(outlines, (optim.batch,), generator=generator),
                 torch.randint(samples, (optim.batch,), generator=generator),
                 torch.randint(len(data.morphs), (optim.latents,), generator=generator),
                 2 * torch.pi * torch.rand(ANGLES, generator=generator),
             )
-
-
-class PriorData(LightningDataModule):
-    """Serves one epoch of `optim.steps` random batches."""
-
-    def __init__(self, prepared: Prepared, config: TrainingConfig) -> None:
-        super().__init__()
-        self.prepared, self.config = prepared, config
-
-    def train_dataloader(self) -> DataLoader:
-        """One pass is the whole training."""
-        return DataLoader(_Draws(self.prepared, self.config), batch_size=None)
+            if step >= self.first:
+                yield batch
 
 
 def _float(array: np.ndarray) -> Tensor:

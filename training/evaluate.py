@@ -127,7 +127,8 @@ def measure_prior(
     draws: int = 2000,
     seed: int = 1234,
 ) -> dict[str, object]:
-    """Everything a card says about a prior that does not need other priors."""
+    """Everything a card says about a prior that does not need other priors; what no draw tells is
+    None."""
     per_outline: dict[str, dict[str, list[float]]] = {}
     pooled: dict[str, list[np.ndarray]] = {}
     for name, vertices in outlines.items():
@@ -141,13 +142,15 @@ def measure_prior(
     latents = shape.sample_latent(draws, torch.Generator().manual_seed(seed))
     unchecked = shape.sample_latent(draws, torch.Generator().manual_seed(seed), checked=False)
     away, felt = level_set_errors(shape, latents[: min(TRACED, draws // 4)])
+    traced = np.isfinite(felt)
     summary = {key: vars(Spread.of(np.concatenate(value))) for key, value in pooled.items()}
     return {
         "training_errors_mm": summary,
         "training_errors_by_outline_mean_p95_max": per_outline,
-        "level_set_to_outline_mm": vars(Spread.of(away)),
-        "level_set_support_mm": vars(Spread.of(felt[np.isfinite(felt)])),
-        "level_set_is": f"traced on a grid of {MM * SPACING} mm at {len(felt)} draws",
+        "level_set_to_outline_mm": vars(Spread.of(away)) if len(away) else None,
+        "level_set_support_mm": vars(Spread.of(felt[traced])) if traced.any() else None,
+        "level_set_is": f"traced on a grid of {MM * SPACING} mm at {len(felt)} draws, "
+        f"one closed curve at {traced.sum()} of them",
         "unchecked_valid_share": float(shape.valid(unchecked).double().mean()),
         "valid_share": plausible_share(shape, latents),
         "valid_draws": draws,

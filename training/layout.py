@@ -12,6 +12,7 @@ codes and from the Gaussian mixture fitted to those, which becomes the prior den
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,9 @@ from scipy.spatial import Delaunay
 
 from training.config import LayoutConfig
 from training.mixture import Mixture, fit_mixture
+
+LEAST_DIFFERENCE = 1e-6
+"""Outlines that differ by less, as a root mean square over all points, do not [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +49,32 @@ def make_layout(
     config: LayoutConfig,
     rng: np.random.Generator,
 ) -> Layout:
-    """Place the codes and draw `config.between` latents between them."""
+    """Place the codes and draw `config.between` latents between them.
+
+    Raises ValueError where the outlines do not differ in as many ways as there are latents.
+    """
+    _check_variety(outlines, latent_dim)
     if latent_dim == 2:
         return _square_layout(outlines, config, rng)
     return _component_layout(outlines, latent_dim, config, rng)
+
+
+def _check_variety(outlines: Float64[np.ndarray, "n p 2"], latent_dim: int) -> None:
+    """Refuse outlines that are all the same, or span fewer dimensions than the latent has.
+
+    Two latents lie on a square whose sites need no more than that outlines differ at all.
+    """
+    n, p, _ = outlines.shape
+    flat = outlines.reshape(n, -1)
+    values = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)
+    ways = int((values > LEAST_DIFFERENCE * math.sqrt(n * p)).sum())
+    if ways == 0:
+        raise ValueError(f"all {n} outlines to train on are the same, expected different ones")
+    if ways < latent_dim > 2:
+        raise ValueError(
+            f"network.latent_dim is {latent_dim}, but {n} outlines differ in {ways} independent "
+            f"ways; expected at most {max(ways, 2)} latents, or more outlines"
+        )
 
 
 def _square_layout(
@@ -181,6 +207,11 @@ def _component_layout(
     seeds = _near_combinations(codes, order[:, : config.neighbours + 1], config, rng)
     outline_weights = weights_at(seeds)[1]
     simple = shapely.is_valid(shapely.polygons((outline_weights @ flat).reshape(len(seeds), -1, 2)))
+    if simple.sum() < config.components:
+        raise ValueError(
+            f"{simple.sum()} of {len(seeds)} outlines between near ones do not cross themselves, "
+            f"expected at least {config.components} (layout.components); raise layout.between"
+        )
     mixture = fit_mixture(seeds[simple], config.components, rng)
     drawn = mixture.draw(config.between - len(seeds), rng)
     latents = np.vstack((seeds, drawn)).clip(-1, 1)

@@ -24,6 +24,7 @@ from training.config import TrainingConfig
 from training.data import Batch, Prepared
 from training.polygons import outward_normals, support
 from training.rates import cosine_rate, split_optimizers
+from training.watch import check_loss
 
 SOFTENING = 0.005
 """Distances count half at this distance from the outline [m], and less beyond."""
@@ -66,6 +67,10 @@ class PriorModule(LightningModule):
         self.automatic_optimization = False
         self.data, self.config = prepared, config
         self.network = initial_network(prepared, config)
+        self.first_loss: float | None = None
+        """Loss of the first step, with which later ones are compared."""
+        self.terms: dict[str, Tensor] = {}
+        """Loss of the last step, whole and term by term."""
         self.own, self.morphs = Targets.of(prepared.targets), Targets.of(prepared.morphs)
 
     def between_latents(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k z"]:
@@ -73,9 +78,13 @@ class PriorModule(LightningModule):
         return self.data.weights[index] @ self.network.codes + self.data.offsets[index]
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
-        """One step of both optimisers."""
+        """One step of both optimisers; TrainingError where the loss says that it would be in
+        vain."""
         terms = self.loss_terms(batch)
         loss = torch.stack(list(terms.values())).sum()
+        self.first_loss = self.first_loss if batch.step else float(loss.detach())
+        self.terms = {"loss": loss.detach()} | {f"loss/{k}": v.detach() for k, v in terms.items()}
+        check_loss(self.terms, self.first_loss, batch.step + 1, self.config.optim)
         optimizers = self.optimizers()
         for optimizer in optimizers:
             optimizer.zero_grad()
@@ -85,9 +94,6 @@ class PriorModule(LightningModule):
             scheduler.step()
         with torch.no_grad():
             self.network.codes.clamp_(-1, 1)
-        if batch_index % 20 == 0:
-            self.log("loss", loss.detach(), prog_bar=True)
-            self.log_dict({f"loss/{name}": term.detach() for name, term in terms.items()})
 
     def loss_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Weighted terms of the loss."""

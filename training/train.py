@@ -13,7 +13,7 @@ from pathlib import Path
 from tpcd.cli import run
 from tpcd.errors import RunError
 from tpcd.files import read_json
-from tpcd.results import resumed_run, run_folder, write_results
+from tpcd.results import CONFIG_FILE, resumed_run, run_folder, write_results
 from tpcd.targets import check_folder
 from training.config import TrainingConfig
 
@@ -40,7 +40,9 @@ def train_prior(config: Training) -> None:
     """Train a shape prior, measure it and write it with its card."""
     # torch and Lightning take seconds to import; --help should not wait for them.
     from tpcd.shape.checkpoint import CARD
-    from training.run import CHECKPOINT, train
+    from training.fitting import check_steps
+    from training.kept import CHECKPOINT, read_kept
+    from training.run import train
 
     settings = {field.name: getattr(config, field.name) for field in fields(TrainingConfig)}
     out = config.out or Path("runs") / config.name
@@ -49,8 +51,8 @@ def train_prior(config: Training) -> None:
     check_folder(export, again)
     began, began_cpu = time.perf_counter(), time.process_time()
     if config.resume:
-        if not (out / CHECKPOINT).is_file():
-            raise RunError(out, f"holds no {CHECKPOINT} to resume from", "leave out --resume")
+        check_steps(out / CHECKPOINT, read_kept(out / CHECKPOINT)[0], config.optim.steps)
+        _check_same_optimiser(out, config)
         may_change = [name for name in vars(config) if name not in ("data", "layout", "network")]
         opened = resumed_run(out, config, may_change)
     else:
@@ -64,6 +66,26 @@ def train_prior(config: Training) -> None:
         write_results(out, table, seeds=[config.optim.seed])
     wall, cpu = time.perf_counter() - began, time.process_time() - began_cpu
     print(f"prior written to {folder} (measuring included: {wall:.0f} s, {cpu:.0f} CPU s)")
+
+
+def _check_same_optimiser(out: Path, config: Training) -> None:
+    """Refuse to resume with settings by which the steps ahead would be other ones: only how many
+    there are, and on how many threads, may change."""
+    import yaml
+
+    path = out / CONFIG_FILE
+    saved = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    before = saved.get("optim") if isinstance(saved, dict) else None
+    if not isinstance(before, dict):
+        raise RunError(out, f"holds no {CONFIG_FILE} of a training", "leave out --resume")
+    differing = [
+        f"optim.{name}"
+        for name, value in vars(config.optim).items()
+        if name not in ("steps", "threads") and value != before.get(name)
+    ]
+    if differing:
+        names = " and ".join(differing)
+        raise RunError(out, f"holds a run with another {names}", "name a new folder")
 
 
 if __name__ == "__main__":

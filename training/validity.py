@@ -13,16 +13,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.errors import TpcdError
 from tpcd.shape.deepsdf import UNIT, DeepSDFNetwork
 from tpcd.shape.density import MaskDensity, MixtureDensity
 from tpcd.shape.simple import one_outline
 from training.mixture import Mixture
-
-
-class TrainingError(TpcdError):
-    """A training that led to no usable prior."""
-
+from training.watch import TrainingError
 
 LEFT_OUT = 0.02
 """Least share of the mixture's draws that lie below the density floor."""

@@ -56,6 +56,7 @@ def predict_episodes(config: Predict) -> None:
         score_rows,
         write_prediction,
     )
+    from tpcd.commands.unexplained import fit_of, other_scene_warning
     from tpcd.data import read_episode
     from tpcd.data.files import TABLE_SUFFIXES
     from tpcd.effects.shape_change import UNCHANGED
@@ -109,6 +110,10 @@ def predict_episodes(config: Predict) -> None:
             predicted.append(rollout_rows(predictor, episode, generator, config.of, rows))
         else:
             predicted.append(predict_rows(predictor, episode, config.of, rows))
+        as_measured = not config.rollout and config.of == "measured"
+        fit = fit_of(predicted[-1] if as_measured else predict_rows(predictor, episode), episode)
+        if told := other_scene_warning(fit):
+            print(f"warning: {episode.path}: {told}", file=sys.stderr)
     write_prediction(predicted, config.out)
     everything = PredictedRows(
         *(torch.cat([getattr(p, name) for p in predicted]) for name in vars(predicted[0]))

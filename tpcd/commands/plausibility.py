@@ -128,6 +128,8 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
         unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))
         told = unexplained_warning(unexplained, rows) if unexplained else None
         found += [f"{run}: of what it was learnt from, {told}"] if told else []
+        unknown = summary.get("unknown_object")
+        found += [f"{run}: {unknown}"] if unknown else []
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "
         found += [name + each for each in check_episode(episode) if each != NO_CONTACT]

@@ -9,17 +9,10 @@ from typing import Any
 import numpy as np
 
 from tpcd.commands.checked import Checked
-from tpcd.quality.channels import POSE, ROTATIONS, WRENCH, Channel, channels_of
+from tpcd.quality.channels import POSE, ROTATIONS, UNITS, WRENCH, Channel, channels_of
 from tpcd.quality.finding import Finding, Weight
 from tpcd.quality.quantity import Quantity
 
-UNITS = {
-    **dict.fromkeys(("x", "y", "z"), "m"),
-    **dict.fromkeys(("rx", "ry", "rz", "e1", "e2", "e3", "phi", "rotation"), "rad"),
-    **dict.fromkeys(("F_x", "F_y", "F_z"), "N"),
-    **dict.fromkeys(("T_x", "T_y", "T_z", "tau"), "N·m"),
-}
-"""SI units of channels; quaternions have none."""
 CLOCK_KINDS = (
     *("rate", "gap", "silent", "clock_back", "clock_jump"),
     *("delay", "moved", "late_start", "early_end"),

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tpcd.data.checks import check_episode, repeated_readings
+from tpcd.data.checks import FREE_OF_NOISE, check_episode, repeated_readings
 from tpcd.data.episode import COLUMNS, Episode
 from tpcd.data.files import locate, read_episode
 from tpcd.data.noise import check_noise
@@ -98,7 +98,9 @@ def check_file(
         [] if entries else [f"no map was given; taken is what the names suggest: {suggestion.line}"]
     )
     log, streams, problem = _read_table(path, columns, used, euler, rate, notes)
-    found = check_recording(streams) if log is None else log.findings
+    found = check_recording(streams)
+    if log is not None:
+        found = tuple(f for f in log.findings if not f.channels or set(f.channels) - log.missing)
     return replace(
         _checked(log, streams, found, stiffness, problem, notes),
         path=path,
@@ -201,7 +203,7 @@ def _check_rows(path: Path) -> Checked:
         doubts += check_noise(episode)
     except EpisodeError as error:
         doubts.append(error.problem)
-    findings = (*repeats, *(Finding("row", Weight.DOUBT, each) for each in doubts))
+    findings = (*repeats, *(Finding("row", _weight(each), each) for each in doubts))
     stream = _rows_stream(episode)
     table = Columns(zip(stream.channels, stream.values.T, strict=True))
     table["time"] = stream.times
@@ -212,6 +214,11 @@ def _check_rows(path: Path) -> Checked:
     )
     quantities = identify(replace(log, findings=()), tuple(episode.stiffness.tolist()))
     return Checked(episode.path or path, "episode", (stream,), findings, quantities=quantities)
+
+
+def _weight(sentence: str) -> Weight:
+    """What is said of an episode without noise, as a simulated one is, is no doubt."""
+    return Weight.NOTE if sentence.endswith(FREE_OF_NOISE) else Weight.DOUBT
 
 
 def _rows_stream(episode: Episode) -> Stream:

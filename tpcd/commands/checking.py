@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from tpcd.commands.check_rows import (
     CLOCK_KINDS,
-    UNITS,
     channel_rows,
     clock_lines,
     known_rows,
@@ -28,8 +27,9 @@ from tpcd.commands.checked import Checked
 from tpcd.commands.verdict import verdict
 from tpcd.figures.recording import Trace, channels_over_time, clocks_over_time
 from tpcd.figures.sinks import save_figure
+from tpcd.figures.style import display_unit
 from tpcd.files import write_json, write_text
-from tpcd.quality.channels import ROTATIONS, WRENCH
+from tpcd.quality.channels import ROTATIONS, UNITS, WRENCH
 from tpcd.quality.finding import Finding, Weight
 from tpcd.quality.stream import Stream
 from tpcd.results import format_table
@@ -133,18 +133,12 @@ def draw_check(checked: Checked) -> dict[str, tuple[Figure, str]]:
             )
             heading = f"{group.capitalize()} over time"
             drawn[group] = (channels_over_time(traces, heading), caption)
-    clocks = {
-        stream.name if len(checked.streams) == 1 else f"{stream.name}: {_role(stream)}": stream
-        for stream in checked.streams
-        if len(stream.times) > FEWEST_DRAWN
-    }
+    clocks = _clocks(checked)
     if clocks and checked.kind == "recording":
-        marks = {
-            name: _marks([f for f in checked.findings if f.kind in CLOCK_KINDS], stream.channels)
-            for name, stream in clocks.items()
-        }
+        found = [f for f in checked.findings if f.kind in CLOCK_KINDS]
+        marks = {n: _marks(found, stream.channels) for n, stream in clocks.items()}
         headings = {
-            name: f"{name}: every {1e3 * _usual(stream):.3g} ms"
+            name: f"{name}: every {1e3 * float(np.median(np.diff(stream.times))):.3g} ms"
             + (f", {len(marks[name])} times marked" if marks[name] else "")
             for name, stream in clocks.items()
         }
@@ -154,6 +148,22 @@ def draw_check(checked: Checked) -> dict[str, tuple[Figure, str]]:
             "Clocks: the time from each sample to the next.",
         )
     return drawn
+
+
+def _clocks(checked: Checked) -> dict[str, Stream]:
+    """Streams by name; those of a table that share their times as one, with all channels."""
+    clocks: dict[str, Stream] = {}
+    for stream in checked.streams:
+        if len(stream.times) <= FEWEST_DRAWN:
+            continue
+        before = clocks.get(stream.name)
+        if before is not None and np.array_equal(before.times, stream.times):
+            channels = (*before.channels, *stream.channels)
+            clocks[stream.name] = replace(before, channels=channels)
+        else:
+            name = stream.name if before is None else f"{stream.name}, {stream.channels[0]}"
+            clocks[name] = stream
+    return clocks
 
 
 def _trace(checked: Checked, name: str) -> Trace | None:
@@ -166,10 +176,13 @@ def _trace(checked: Checked, name: str) -> Trace | None:
     marks = _marks(own, names, checked.kind == "episode")
     counts = {kind: sum(mark[0] == kind for mark in marks) for kind, _, _ in marks}
     told = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in counts.items())
+    if np.ptp(found[1][np.isfinite(found[1])]) == 0:
+        told = told or "never changes"
     noise = {each.name: each for each in checked.noises}.get(name)
     quiet = ""
     if noise is not None and noise.sample > 0:
-        quiet = f", noise {noise.sample:.2g} {UNITS.get(name, '')} at rest"
+        factor, unit = display_unit(UNITS.get(name, ""))
+        quiet = f", noise {factor * noise.sample:.2g} {unit} at rest"
     return Trace(
         name,
         UNITS.get(name, ""),
@@ -200,16 +213,6 @@ def _marks(
         elif each.start is not None and each.end is not None and np.isfinite(each.start + each.end):
             marks.append((each.kind, each.start, each.end))
     return marks
-
-
-def _role(stream: Stream) -> str:
-    if any(name.startswith("u_") for name in stream.channels):
-        return "set point"
-    return "wrench" if set(stream.channels) & set(WRENCH) else "pose"
-
-
-def _usual(stream: Stream) -> float:
-    return float(np.median(np.diff(stream.times)))
 
 
 def _arm_lines(checked: Checked) -> list[str]:

@@ -36,6 +36,7 @@ NOISE_FACTOR = 6.0
 ROUNDING = 1e-6
 """Start pose and command may differ by this much [m, rad] on top of noise: printed digits."""
 NO_CONTACT = "no step shows contact beyond the noise: it tells only where nothing is"
+FREE_OF_NOISE = "taken as free of noise"
 INVERTED = -0.3
 """A wrench that is less than this many times K (pose - command) has the opposite sign."""
 ANOTHER_ORDER = 5.0
@@ -203,7 +204,7 @@ def check_episode(episode: Episode) -> list[str]:
     warnings += map(str, repeated_readings(episode))
     silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
     if silent:
-        warnings.append(f"sensor_std of {', '.join(silent)} is 0: taken as free of noise")
+        warnings.append(f"sensor_std of {', '.join(silent)} is 0: {FREE_OF_NOISE}")
     return warnings
 
 

@@ -75,7 +75,7 @@ def channels_over_time(traces: Sequence[Trace], heading: str) -> Figure:
         entries["recorded"] = Patch(color=BELIEF)
         for kind, start, end in trace.marks:
             colour = KINDS.get(kind, OTHER_KIND)
-            panel.axvspan(start, end, color=colour, alpha=0.35, linewidth=0.8)
+            panel.axvspan(start, end, color=colour, alpha=0.35, linewidth=0.8, zorder=0.5)
             entries[kind.replace("_", " ")] = Patch(color=colour, alpha=0.5)
         panel.set_ylabel(axis_label(_label(trace.name), trace.unit))
         title(panel, trace.heading)
@@ -103,7 +103,7 @@ def clocks_over_time(
         draw_samples(panel, times[1:], spacing, BELIEF, 0.7)
         for kind, start, end in marks.get(name, ()):
             colour = KINDS.get(kind, OTHER_KIND)
-            panel.axvspan(start, end, color=colour, alpha=0.35, linewidth=0.8)
+            panel.axvspan(start, end, color=colour, alpha=0.35, linewidth=0.8, zorder=0.5)
             entries[kind.replace("_", " ")] = Patch(color=colour, alpha=0.5)
         usual = float(np.median(spacing)) if len(spacing) else 1.0
         if len(spacing) and spacing.min() > 0 and spacing.max() > 20 * usual > 0:

@@ -23,6 +23,13 @@ WRENCH = (*FORCES, *TORQUES)
 POSITIONS = ("x", "y", "z")
 ROTATIONS = ("rx", "ry", "rz", "qx", "qy", "qz", "qw", "e1", "e2", "e3", "phi")
 POSE = (*POSITIONS, *ROTATIONS)
+UNITS = {
+    **dict.fromkeys(POSITIONS, "m"),
+    **dict.fromkeys(("rx", "ry", "rz", "e1", "e2", "e3", "phi", "rotation"), "rad"),
+    **dict.fromkeys(FORCES, "N"),
+    **dict.fromkeys(TORQUES, "N·m"),
+}
+"""SI units of channels; quaternions have none."""
 MIXED = np.sqrt([1.0, 2.0, 3.0, 5.0])
 """A sum with these weights changes where any of its parts does."""
 MOST_LISTED = 6
@@ -119,8 +126,10 @@ def _missing(stream: Stream) -> Iterator[Finding]:
 def _listed(rows: Int[np.ndarray, " k"]) -> str:
     """Rows as ranges, the first few of them."""
     cuts = np.flatnonzero(np.diff(rows) > 1)
-    firsts, lasts = rows[np.append(0, cuts + 1)], rows[np.append(cuts, len(rows) - 1)]
-    parts = [f"{a}" if a == b else f"{a} to {b}" for a, b in zip(firsts, lasts, strict=True)]
+    parts = [
+        f"{part[0]}" if len(part) == 1 else f"{part[0]} to {part[-1]}"
+        for part in np.split(rows, cuts + 1)
+    ]
     return ", ".join(parts[:MOST_LISTED]) + (", …" if len(parts) > MOST_LISTED else "")
 
 

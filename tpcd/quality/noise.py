@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tpcd.quality.channels import POSE, WRENCH, Channel, channels_of
+from tpcd.quality.channels import POSE, UNITS, WRENCH, Channel, channels_of
 from tpcd.quality.finding import Finding, Weight
+from tpcd.quality.habit import grid_step
 from tpcd.quality.stream import Stream
 
 WINDOW = 0.5
@@ -119,8 +120,8 @@ def check_noise_at_rest(noises: Sequence[RestNoise]) -> tuple[Finding, ...]:
         Finding(
             "creep",
             Weight.NOTE,
-            f"{each.name} creeps by {each.creep:.2g} in {each.creep_time:.3g} s at rest, where a"
-            f" row's noise is {each.row:.2g}",
+            f"{each.name} creeps by {each.creep:.2g} {UNITS[each.name]} in {each.creep_time:.3g} s"
+            f" at rest, where a row's noise is {each.row:.2g}",
             (each.name,),
             remedy="wait before reading, or zero the sensor more often",
         )
@@ -193,7 +194,8 @@ def _measured(
         of_means.append((np.diff(blocks) ** 2).mean() / 2.0 / BLOCKS)
         means.append(part.mean())
     # What is below the resolution is not seen: a reading is off by up to half a step.
-    least = channel.habit.step / math.sqrt(12.0)
+    step = grid_step(values) if channel.name == "rotation" else channel.habit.step
+    least = step / math.sqrt(12.0)
     row = max(math.sqrt(float(np.mean(of_means))), least)
     creep, lasted = _creep(np.array(means), times[np.array(parts) - [0, 1]], row)
     sample = max(math.sqrt(float(np.median(squares))), least)

@@ -69,7 +69,8 @@ def check_units(streams: Sequence[Stream]) -> tuple[Finding, ...]:
         for unit in _UNITS:
             found += _too_large(stream, unit)
         found += _too_small(stream)
-        found += _too_fast(stream)
+        if max(_sizes(stream, _ANGLES).values(), default=0.0) <= TURN:
+            found += _too_fast(stream)
         found += _lever(stream)
         found += _clock(stream)
     return (*found, *_apart(streams))

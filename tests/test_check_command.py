@@ -99,7 +99,7 @@ def test_millimetres_without_their_unit_are_not_usable(
     assert checking(str(path), "--map", *entries, "--out", str(tmp_path / "out")) == 5
     printed = capsys.readouterr().out
     assert "not usable as it is read" in printed and "looks like millimetres" in printed
-    assert "x=COLUMN:mm" in printed
+    assert "=COLUMN:mm" in printed
     # What the numbers suggest reads them rightly.
     assert checking(str(path), "--out", str(tmp_path / "suggested")) == 0
     assert "x=x:mm" in capsys.readouterr().out

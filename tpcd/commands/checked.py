@@ -139,9 +139,9 @@ def _read_table(
         turned = [n for n in mapped if n[0] in "qre" or n == "phi"]
         if not {"F_x", "F_z"} <= set(mapped) or {"x", "z"} <= set(mapped) or not turned:
             return None, _streams(path, columns, mapped, rate), error.problem
-        columns[ZERO] = np.zeros(len(next(iter(columns.values()))))
+        zeros = {ZERO: np.zeros(len(next(iter(columns.values()))))}
         more = [f"{name}={ZERO}" for name in ("x", "z") if name not in mapped]
-        log = log_from_columns(columns, [*entries, *more], path, euler, rate)
+        log = log_from_columns({**columns, **zeros}, [*entries, *more], path, euler, rate)
         log = replace(log, missing=log.missing | {"x", "z"} - set(mapped))
         notes.append("no positions were recorded: rotation and wrench alone are checked")
     notes += log.notes
@@ -205,8 +205,7 @@ def _check_rows(path: Path) -> Checked:
         doubts.append(error.problem)
     findings = (*repeats, *(Finding("row", _weight(each), each) for each in doubts))
     stream = _rows_stream(episode)
-    table = Columns(zip(stream.channels, stream.values.T, strict=True))
-    table["time"] = stream.times
+    table = dict(zip(stream.channels, stream.values.T, strict=True)) | {"time": stream.times}
     log = log_from_columns(
         table,
         ["time=time", *(f"{name}={name}" for name in stream.channels)],

@@ -126,8 +126,8 @@ def _pivoted(held: Sequence[Held], config: Measurements, out: Path) -> dict[str,
     columns = joined(held)
     table = write_table(out / "tables" / "pbal.csv", columns)
     entries = tuple(f"{name}={name}" for name in columns)
-    stiffness = tuple(float(k) for k in held[0].stiffness)
-    recording = Recording("pbal", "pbal_impedance", table, entries, stiffness=stiffness)
+    x, z, phi = held[0].stiffness.tolist()
+    recording = Recording("pbal", "pbal_impedance", table, entries, stiffness=(x, z, phi))
     log = recording.read()
     commands = _commands(recording, out)
     stem = out / "pbal" / "episode"

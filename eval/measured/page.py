@@ -46,7 +46,7 @@ def page_text(results: Mapping[str, Any]) -> str:
         parts += [_balance(each["balance"])] if "balance" in each else []
         parts += [_told(each["told"]), *(_said(command) for command in each["commands"])]
     versions = results["versions"]
-    parts.append(f"Revision {versions['git']}, {versions['date']}.\n")
+    parts.append(f"Revision {versions['git']}, {versions['date_utc']}.\n")
     return "\n".join(parts)
 
 

@@ -33,7 +33,12 @@ class Estimate:
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
         """Lower and upper ends of the intervals, by Student's t."""
         half = student.ppf(0.5 + level / 2, self.freedom) * self.error
-        return self.value - half, self.value + half
+        return np.asarray(self.value - half), np.asarray(self.value + half)
+
+    def parts(self) -> list[Estimate]:
+        """Each value of a vector by itself."""
+        pairs = zip(self.value, self.error, strict=True)
+        return [Estimate(np.asarray(v), np.asarray(e), self.freedom) for v, e in pairs]
 
 
 def correlation_time(values: Float[np.ndarray, " n"]) -> float:
@@ -72,10 +77,10 @@ def jackknife(
 ) -> Estimate:
     """What `compute` makes of the sum over all blocks, and how far it depends on each of them."""
     total = sums.sum(0)
-    left = np.stack([compute(total - part) for part in sums])
+    left = np.stack([np.asarray(compute(total - part)) for part in sums])
     count = len(sums)
     error = np.sqrt((count - 1) / count * ((left - left.mean(0)) ** 2).sum(0))
-    return Estimate(compute(total), error, count - 1)
+    return Estimate(np.asarray(compute(total)), np.asarray(error), count - 1)
 
 
 def partial(products: Float[np.ndarray, "p p"], kept: int) -> Float[np.ndarray, "k k"]:

@@ -16,8 +16,9 @@ from jaxtyping import Float
 from tpcd.logs.log import Log
 from tpcd.quality.blocks import block_edges, correlation_time
 from tpcd.quality.impedance import NAMES, PRESS, computed, impedance
+from tpcd.quality.load import weigh
 from tpcd.quality.parity import Parity, spring_wrench
-from tpcd.quality.payload import ORIENTATIONS, payload, weigh
+from tpcd.quality.payload import ORIENTATIONS, payload, useless
 from tpcd.quality.quantity import Quantity, untold
 from tpcd.quality.rests import UP, Observed, find_rests, observe_rests, recorded_axes
 from tpcd.quality.springs import springs
@@ -123,7 +124,11 @@ def _hull(same: Sequence[Quantity]) -> Quantity:
     if untold_ones:
         return untold_ones[0]
     ends = [end for each in same for end in each.interval or ()]
-    return replace(same[0], interval=(min(ends), max(ends))) if ends else same[0]
+    found = replace(same[0], interval=(min(ends), max(ends))) if ends else same[0]
+    if not useless(found):
+        return found
+    reason = "the stiffness is known too roughly for what is left beside it"
+    return replace(found, value=None, interval=None, basis="", reason=reason, motion=ORIENTATIONS)
 
 
 def _without_commands() -> tuple[Quantity, ...]:

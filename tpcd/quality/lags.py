@@ -23,7 +23,7 @@ EXPLAINED = 0.2
 """The best shift explains so much, or the lag is not told."""
 MOVING = 0.2
 """Part of the time for which the arm goes on the same way, below which all of it counts."""
-RESOLVED = 0.25
+RESOLVED = 0.5
 """Part of the time between samples that no interval is narrower than, either way: friction and
 noise bend the curve between two shifts."""
 HORIZON = 0.1
@@ -77,22 +77,30 @@ def wrench_lag(parity: Parity) -> Quantity:
     """How long the wrench comes after x - u [s]; damping looks like the opposite."""
     springs = parity.springs
     name, motion = "wrench_lag", "press and let go at several speeds, sampled at 20 Hz or more"
+    told = {
+        letter: [axis.index for axis in parity.told if axis.letter == letter and axis.told]
+        for letter in "FT"
+    }
     reason = _sparse(springs)
-    if not reason and not any(axis.told for axis in parity.told):
+    if not reason and not any(told.values()):
         reason = "the wrench does not go with x - u"
     if reason:
         return Quantity(name, "s", reason=reason, motion=motion)
-    wrench = readings(springs, "F", parity.frame, parity.axes)
-    away = displacements(springs, "F", parity.axes)
-    kept = [axis.index for axis in parity.told if axis.letter == "F" and axis.told]
+    wrench, away = (
+        np.concatenate([part(letter)[:, kept] for letter, kept in told.items()], axis=1)
+        for part in (
+            lambda letter: readings(springs, letter, parity.frame, parity.axes),
+            lambda letter: displacements(springs, letter, parity.axes),
+        )
+    )
     times = springs.log.times
     basis = "damping D of the controller looks like a lag of -D / K"
     return _lag(
         springs,
         name,
         motion,
-        wrench[:, kept],
-        lambda shift: _at(times - shift, times, away[:, kept]),
+        wrench,
+        lambda shift: _at(times - shift, times, away),
         basis,
         centre=True,
     )

@@ -31,6 +31,10 @@ from tpcd.quality.springs import Springs
 WIDE = np.radians(10.0)
 """An end effector that turned less shows nothing of which axes a wrench is in [rad]."""
 
+STRAIGHT = 0.005
+"""Part of a stiffness that no interval is narrower than, either way: friction that sticks and
+commands that move while a pose lags are not the straight lines that are fitted (0.3 % in made
+recordings of arms that do both)."""
 OWN = 6
 """Columns w, e, 1, direction, rates of e and u come first; what the axes share comes after."""
 
@@ -62,9 +66,11 @@ class Axis:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Of the stiffness."""
+        """Of the stiffness, never narrower than `STRAIGHT`."""
         ends = (*self.low.bounds(), *self.high.bounds())
-        return float(min(ends)), float(max(ends))
+        margin = STRAIGHT * abs(self.stiffness)
+        low, high = float(min(ends)), float(max(ends))
+        return min(low, self.stiffness - margin), max(high, self.stiffness + margin)
 
     @property
     def stiffness(self) -> float:
@@ -76,7 +82,7 @@ class Axis:
     def told(self) -> bool:
         """Whether e explains anything of w."""
         low, high = self.interval
-        return low * high > 0 and np.isfinite(high)
+        return bool(low * high > 0 and np.isfinite(high))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +184,7 @@ def _axis(
 
     with np.errstate(invalid="ignore"):
         found = jackknife(ends, sums)
-    parts = [Estimate(v, e, found.freedom) for v, e in zip(found.value, found.error, strict=True)]
+    parts = found.parts()
     inner = partial(whole, 2)
     explained = float(inner[0, 1] ** 2 / max(inner[0, 0] * inner[1, 1], 1e-300))
     zero, friction = (parts[2], parts[6]), (parts[3], parts[7])
@@ -202,11 +208,20 @@ def _nuisance(
         turn = springs.frames
         rows = turn[:, k] if axes == "world" else turn[:, :, k]
         found += list((rows if letter == "F" else turn.reshape(len(turn), 9)).T)
-    found += [away[:, j] for j in springs.axes(letter) if j != k]
-    if letter == "T" and springs.axes("F"):
-        force = readings(springs, "F", frame, axes)
-        found += [force[:, j] for j in springs.axes("F") if j != k]
+    for mixed in ("F",) if letter == "F" else ("T", "F"):
+        found += list(_mixed(springs, mixed, k, frame, axes).T)
     return found
+
+
+def _mixed(
+    springs: Springs, letter: str, k: int, frame: str, axes: str
+) -> Float[np.ndarray, "n 3"]:
+    """What small rotations of the sensor about each axis of the end effector, or levers along them,
+    bring from other components of a reading into the k-th."""
+    other, third = (k + 1) % 3, (k + 2) % 3
+    reading = readings(springs, letter, frame, axes)
+    turn = springs.frames if axes == "world" else np.broadcast_to(np.eye(3), springs.frames.shape)
+    return turn[:, other] * reading[:, third, None] - turn[:, third] * reading[:, other, None]
 
 
 def _directions(springs: Springs, column: int, axes: str) -> Float[np.ndarray, " n"]:

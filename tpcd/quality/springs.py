@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from tpcd.logs.log import AXES, Log
 from tpcd.quality.blocks import block_edges, correlation_time
@@ -83,7 +84,9 @@ class Springs:
             return np.zeros((count, 6))
         first = np.clip(np.arange(count) - span, 0, None)
         last = np.clip(np.arange(count) + (0 if self.sparse else span), None, count - 1)
-        turn = (log.rotations[last] * log.rotations[first].inv()).as_rotvec()
+        quaternions = log.rotations.as_quat()
+        before, after = (Rotation.from_quat(quaternions[k]) for k in (first, last))
+        turn = (after * before.inv()).as_rotvec()
         moved = np.concatenate((log.positions[last] - log.positions[first], turn), axis=1)
         speeds = moved / np.maximum(log.times[last] - log.times[first], 1e-12)[:, None]
         steps = (log.rotations[1:] * log.rotations[:-1].inv()).as_rotvec()

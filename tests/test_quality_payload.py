@@ -92,7 +92,7 @@ def test_one_orientation_tells_neither_weight_nor_bias_and_how_to_move() -> None
     told = identify(log)
     for name in ("weight", "force_bias_z", "torque_bias_x", "centre_of_mass_z"):
         found = quantity(told, name)
-        assert not found.told and "1 orientations" in found.reason
+        assert not found.told and "in 1 orientation," in found.reason
         assert "six orientations" in found.motion
 
 

@@ -71,13 +71,14 @@ def _measured(recording: Recording, out: Path) -> dict[str, Any]:
 
     log = recording.read()
     told = [asdict(each) for each in identify(log)]
-    commands = _commands(recording, out)
     known = [
         {"name": name, "known": value, **_holds(told, name, value)}
         for name, value in recording.known.items()
     ]
     about = {"name": recording.name, "set": recording.set, "samples": len(log)}
-    return {**about, "commands": commands, "told": told, "known": known}
+    about["notes"] = recording.notes
+    checked, imported = _checked(recording, out), _imported(recording, out)
+    return {**about, "checked": checked, "told": told, "known": known, "commands": [imported]}
 
 
 def _holds(told: Sequence[dict[str, Any]], name: str, value: float) -> dict[str, Any]:
@@ -86,39 +87,55 @@ def _holds(told: Sequence[dict[str, Any]], name: str, value: float) -> dict[str,
     return {**found, "holds": interval is not None and interval[0] <= value <= interval[1]}
 
 
-def _commands(recording: Recording, out: Path) -> list[dict[str, Any]]:
-    name = recording.table.stem
-    stiffness = [f"{k:g}" for k in recording.stiffness]
-    imported = ["--stiffness", *stiffness, *recording.more, "--out", str(out / f"import-{name}")]
-    return [
-        _said("check", [*recording.arguments(), "--out", str(out / f"check-{name}")], out),
-        _said("import_log", [*recording.arguments(), *imported], out),
+def _checked(recording: Recording, out: Path) -> dict[str, Any]:
+    """Verdict, findings and noise of each channel, as check writes them."""
+    from tpcd.errors import FileError
+    from tpcd.files import read_json
+
+    folder = out / f"check-{recording.table.stem}"
+    said = _said("check", [*recording.arguments(), "--out", str(folder)], out)
+    if not (folder / "results.json").is_file():
+        raise FileError(recording.table, f"check ends with {said['code']}", "\n".join(said["said"]))
+    results = read_json(folder / "results.json")
+    noise = [
+        {key: row[key] for key in ("channel", "unit", "noise of a sample", "noise of a row")}
+        for row in results["table"]
     ]
+    found = [f"{each['weight']}: {each['sentence']}" for each in results["findings"]]
+    return {"code": said["code"], "verdict": results["verdict"], "findings": found, "noise": noise}
+
+
+def _imported(recording: Recording, out: Path) -> dict[str, Any]:
+    folder = str(out / f"import-{recording.table.stem}")
+    stiffness = [f"{k:g}" for k in recording.stiffness]
+    choices = ["--stiffness", *stiffness, *recording.more, "--out", folder]
+    return _said("import_log", [*recording.arguments(), *choices], out)
 
 
 def _said(script: str, arguments: Sequence[str], out: Path) -> dict[str, Any]:
     """Exit code and lines of a command, without places of this machine."""
     command = [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    lines = []
-    for stream in (done.stdout, done.stderr):
-        for line in stream.splitlines():
-            # A bar of progress writes over itself.
-            last = line.rsplit("\r", 1)[-1].strip()
-            if last and "step/s" not in last:
-                lines.append(_placeless(last, [out, *map(Path, arguments)]))
-    return {"command": f"scripts/{script}.py", "code": done.returncode, "said": lines}
+    lines = [line.rstrip() for line in f"{done.stdout}\n{done.stderr}".splitlines()]
+    # A bar of progress is no line of its own.
+    kept = [line for line in lines if line.strip() and "%|" not in line]
+    places = [str(out.absolute()), str(out), *(str(Path(a).parent) for a in arguments if "/" in a)]
+    return {
+        "command": f"scripts/{script}.py",
+        "code": done.returncode,
+        "said": [placeless(line, places) for line in kept],
+    }
 
 
-def _placeless(line: str, places: Sequence[Path]) -> str:
-    for place in places:
-        if place.is_absolute() or len(place.parts) > 1:
-            line = line.replace(f"{place.parent}/", "")
+def placeless(line: str, places: Sequence[str]) -> str:
+    """A line that names files in `places` without saying where those are."""
+    for place in sorted(places, key=len, reverse=True):
+        line = line.replace(f"{place}/", "")
     return line
 
 
 def _pivoted(held: Sequence[Held], config: Measurements, out: Path) -> dict[str, Any]:
-    from eval.measured.pivoting import episode, joined
+    from eval.measured.pivoting import NOTES, episode, joined
     from eval.measured.sets import Recording, write_table
     from tpcd.data.files import episode_contents, write_together
     from tpcd.quality.identify import identify
@@ -129,7 +146,7 @@ def _pivoted(held: Sequence[Held], config: Measurements, out: Path) -> dict[str,
     x, z, phi = held[0].stiffness.tolist()
     recording = Recording("pbal", "pbal_impedance", table, entries, stiffness=(x, z, phi))
     log = recording.read()
-    commands = _commands(recording, out)
+    commands = [_imported(recording, out)]
     stem = out / "pbal" / "episode"
     stem.parent.mkdir()
     contents = episode_contents(episode(held), stem)
@@ -137,9 +154,10 @@ def _pivoted(held: Sequence[Held], config: Measurements, out: Path) -> dict[str,
     given = [str(stem.parent), "--prior", config.prior, "--seed", str(config.seed)]
     for script in ("estimate", "diagnose"):
         commands.append(_said(script, [*given, "--out", str(out / f"pbal-{script}")], out))
-    about = {"name": "pbal", "set": "pbal_impedance", "samples": len(log)}
+    about = {"name": "pbal", "set": "pbal_impedance", "samples": len(log), "notes": NOTES}
     told = [asdict(each) for each in identify(log)]
-    return {**about, "commands": commands, "told": told, "known": [], "balance": balance(held)}
+    found = {"checked": _checked(recording, out), "told": told, "known": []}
+    return {**about, **found, "commands": commands, "balance": balance(held)}
 
 
 def balance(held: Sequence[Held]) -> dict[str, Any]:

@@ -42,9 +42,14 @@ def page_text(results: Mapping[str, Any]) -> str:
     parts = [HEAD]
     for each in results["recordings"]:
         parts.append(f"## {each['name']}\n\n{SOURCES[each['set']]}; {each['samples']} samples.\n")
+        parts += [" ".join(each["notes"]) + "\n"] if each["notes"] else []
         parts += [_known(each["known"])] if each["known"] else []
         parts += [_balance(each["balance"])] if "balance" in each else []
-        parts += [_told(each["told"]), *(_said(command) for command in each["commands"])]
+        parts += [
+            _checked(each["checked"]),
+            _told(each["told"]),
+            *(_said(command) for command in each["commands"]),
+        ]
     versions = results["versions"]
     parts.append(f"Revision {versions['git']}, {versions['date_utc']}.\n")
     return "\n".join(parts)
@@ -68,6 +73,20 @@ def _known(rows: Sequence[Mapping[str, Any]]) -> str:
         name = f"{found.name.replace('_', ' ')} [{found.unit}]"
         word = "yes" if row["holds"] else "**no**"
         lines.append(f"| {name} | {row['known']:.3f} | {told} | {found.level:.0%} | {word} |")
+    return "\n".join(lines) + "\n"
+
+
+def _checked(found: Mapping[str, Any]) -> str:
+    lines = [f"`scripts/check.py` ends with {found['code']}: {found['verdict']}.\n"]
+    lines += [f"- {each}" for each in found["findings"]]
+    columns = ("noise of a sample", "noise of a row")
+    noise = [row for row in found["noise"] if any(row[name] is not None for name in columns)]
+    if not noise:
+        return "\n".join([*lines, "\nIt does not rest, so noise is not told.\n"])
+    lines += ["", "| channel | noise of a sample | noise of a row of 0.5 s |", "|---|---|---|"]
+    for row in noise:
+        told = [f"{row[n]:.2g} {row['unit']}" if row[n] is not None else "–" for n in columns]
+        lines.append(f"| {row['channel']} | {' | '.join(told)} |")
     return "\n".join(lines) + "\n"
 
 

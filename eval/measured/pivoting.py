@@ -22,6 +22,13 @@ from jaxtyping import Float
 
 from tpcd.data.episode import Episode
 
+NOTES = (
+    "Eight recordings of one held command each, while the palm that was let go off its target comes"
+    " to rest: eight rows, put ten seconds apart. No force was recorded: the wrench is K (x - u).",
+    "Nothing begins free, so the import refuses them. For estimate and diagnosis an episode was"
+    " made with a free start that is assumed, the palm above the first row; its notes say so.",
+    "The object slips and pivots in the palm, so that a rigid grasp is false.",
+)
 LAST = 0.5
 """Seconds at the end of a recording that make its row, as in an import."""
 HEIGHT = 0.1

@@ -38,6 +38,8 @@ class Recording:
     """Further options of import."""
     known: Mapping[str, float] = field(default_factory=dict)
     """What those who made the set found, by the name of the quantity."""
+    notes: tuple[str, ...] = ()
+    """What the recording does not say, and what was taken for it."""
 
     def arguments(self) -> list[str]:
         """How a command is told to read the table."""
@@ -101,8 +103,28 @@ def _ati(folder: Path, out: Path) -> list[Recording]:
     same = tuple(f"{name}={name}" for name in names)
     return [
         # One row was kept of each rest: ten seconds apart is as good as any.
-        Recording("ati, 7 static poses", folder.name, static, same, rate=0.1, known=UPSTREAM),
-        Recording("ati, turning", folder.name, timed, ("time=time", *same), more=("--window", "2")),
+        Recording(
+            "ati, 7 static poses",
+            folder.name,
+            static,
+            same,
+            rate=0.1,
+            known=UPSTREAM,
+            notes=(
+                "Poses in one file, wrenches in another, neither with a header or times; one row"
+                " of each rest, taken as ten seconds apart.",
+                "The wrench is in axes of the base here and of the sensor in the next recording;"
+                " nothing tells the commands so.",
+            ),
+        ),
+        Recording(
+            "ati, turning",
+            folder.name,
+            timed,
+            ("time=time", *same),
+            more=("--window", "2"),
+            notes=("No header and no positions, which are set to 0.",),
+        ),
     ]
 
 
@@ -124,6 +146,14 @@ def _franka(folder: Path) -> list[Recording]:
             rate=20.0,
             stiffness=(400.0, 1100.0, 30.0),
             more=("--tare",),
+            notes=(
+                "No times: 20 Hz are those of the set's own README. Neither frame nor zero of the"
+                " wrench is stated, nor a stiffness; the wrench is estimated from joint torques,"
+                " so friction of the joints is in it.",
+                "Quaternions begin with w; those of the goal are interpolated and not quite of"
+                " unit length.",
+                "It touches things during most of the recording and is nowhere said to be free.",
+            ),
         )
         for table in tables
     ]
@@ -134,4 +164,5 @@ def _iiwa(folder: Path) -> Recording:
     entries = ("time=timestamp:ms", "x=X", "y=Y", "z=Z", "e1=A", "e2=B", "e3=C")
     entries += tuple(f"{name}={name.replace('_', '')}" for name in WRENCH)
     stiffness = (2000.0, 1000.0, 200.0)
-    return Recording("iiwa", "iiwa_screw_contact", table, entries, stiffness=stiffness)
+    notes = ("The set point was not recorded, nor is the frame of the wrench documented.",)
+    return Recording("iiwa", "iiwa_screw_contact", table, entries, stiffness=stiffness, notes=notes)

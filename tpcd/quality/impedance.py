@@ -12,7 +12,7 @@ import numpy as np
 
 from tpcd.quality.blocks import Estimate
 from tpcd.quality.lags import pose_lag, wrench_lag
-from tpcd.quality.parity import Axis, Parity, choose_frames
+from tpcd.quality.parity import Axis, Parity, choose_frames, displacements, readings
 from tpcd.quality.quantity import Quantity, untold
 from tpcd.quality.springs import Springs
 
@@ -47,7 +47,24 @@ def impedance(
 
 def computed(parity: Parity) -> bool:
     """Whether the wrench is K (x - u) to the last digits in every axis: no sensor reads so."""
-    return bool(parity.told) and all(axis.explained > 1 - EXACT for axis in parity.told)
+    slopes = _slopes(parity)
+    return bool(slopes) and all(explained > 1 - EXACT for _, explained in slopes.values())
+
+
+def _slopes(parity: Parity) -> dict[str, tuple[float, float]]:
+    """Of each axis that changes, the slope of w over x - u and the part of w that it explains."""
+    springs, found = parity.springs, {}
+    for name in NAMES:
+        letter, k = "T" if name.startswith("r") else "F", "xyz".index(name[-1])
+        if k not in springs.axes(letter):
+            continue
+        wrench = readings(springs, letter, parity.frame, parity.frame)[:, k]
+        away = displacements(springs, letter, parity.frame)[:, k]
+        wrench, away = wrench - wrench.mean(), away - away.mean()
+        both, own, other = wrench @ away, wrench @ wrench, away @ away
+        if own > 0 and other > 0:
+            found[name] = both / other, both**2 / (own * other)
+    return found
 
 
 def _computed(parity: Parity) -> tuple[Quantity, ...]:
@@ -55,14 +72,13 @@ def _computed(parity: Parity) -> tuple[Quantity, ...]:
     and nothing of sensor or friction."""
     basis = "w is K (x - u) to the last digits, so no sensor's noise is in it"
     told = [Quantity("wrench_source", "", "computed from x - u, not measured", basis=basis)]
+    slopes = _slopes(parity)
     for k, axis in enumerate(NAMES):
-        found = _axis(parity, k)
-        unit = "N/m" if k < 3 else "N·m/rad"
-        if found is None:
-            told.append(Quantity(f"stiffness_{axis}", unit, reason=_missing(parity, k)))
+        name, unit = f"stiffness_{axis}", "N/m" if k < 3 else "N·m/rad"
+        if axis in slopes:
+            told.append(Quantity(name, unit, slopes[axis][0], basis="what w was made with"))
         else:
-            value = float(found.low.value)
-            told.append(Quantity(f"stiffness_{axis}", unit, value, basis="what w was made with"))
+            told.append(Quantity(name, unit, reason=_missing(parity, k)))
     reason, motion = "the wrench was computed from x - u", "record a force sensor beside it"
     for kind, units in (("gain", ("", "")), ("parity_zero", UNITS), ("arm_friction", UNITS)):
         for k, axis in enumerate(NAMES):

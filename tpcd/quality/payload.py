@@ -56,7 +56,8 @@ def _why(seen: Observed) -> str:
     if len(seen.force_axes) < 2:
         return "fewer than two components of the force were recorded"
     if len(seen) < FEWEST:
-        return f"the arm rests in {len(seen)} orientations, and {FEWEST} are the least"
+        count = f"{len(seen)} orientation{'' if len(seen) == 1 else 's'}"
+        return f"the arm rests in {count}, and {FEWEST} are the least"
     return f"its orientations differ by {_spread(seen):.2g} degrees only"
 
 

@@ -130,6 +130,7 @@ class OptimConfig:
         weights = {"distance_weight": 0, "support_weight": 0, "outline_weight": 0}
         check_numbers(self, {**least, **rates, **weights})
         _check_most(self, steps=100_000_000, batch=10_000_000, latents=1_000_000, threads=1024)
+        _check_most(self, distance_weight=1e6, support_weight=1e6, outline_weight=1e6)
         if self.distance_weight == self.support_weight == self.outline_weight == 0:
             raise ValueError(f"{' and '.join(weights)} are 0, expected one of them above")
 

@@ -44,8 +44,10 @@ def fit(
         module.load_state_dict(weights)
         module.first_loss = before.first_loss
     keeper = Keeper(path, prepared.data_hash, config, before, began or clocks())
+    last_loss = before.last_loss
     if before.steps_done < steps:
         _go(module, Batches(prepared, config, before.steps_done), keeper, out, resume)
+        last_loss = float(module.terms["loss"])
     assert keeper.steps_done == steps, f"{keeper.steps_done} of {steps} steps done"
     wall, cpu = keeper.seconds()
     return replace(
@@ -53,6 +55,7 @@ def fit(
         data_sha256=prepared.data_hash,
         steps_done=steps,
         first_loss=module.first_loss,
+        last_loss=last_loss,
         schedules=before.followed_by(steps),
         wall_seconds=wall,
         cpu_seconds=cpu,

@@ -47,6 +47,8 @@ class Kept:
     """Steps that the weights have seen."""
     first_loss: float | None = None
     """Loss of the first step."""
+    last_loss: float | None = None
+    """Loss of the last of them."""
     schedules: tuple[tuple[int, int], ...] = ()
     """From which step on the learning rates were those of a training of how many steps; more than
     one where a training was resumed with another number."""
@@ -104,6 +106,7 @@ class Keeper(Callback):
             self.data_sha256,
             self.steps_done,
             pl_module.first_loss,
+            float(pl_module.terms["loss"]),
             self.before.followed_by(self.config.optim.steps),
             wall,
             cpu,

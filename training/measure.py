@@ -70,7 +70,12 @@ def training_of(folder: Path) -> tuple[TrainingConfig, dict[str, np.ndarray]]:
     card = load_prior(folder).card
     if "configuration" not in card or "data_sha256" not in card:
         raise CheckpointError(folder, "has a card without its training", "train it again")
-    trained = config_of(dict(card["configuration"]))
+    try:
+        trained = config_of(dict(card["configuration"]))
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(
+            folder, f"has a card whose configuration is not understood ({error})", "train it again"
+        ) from error
     outlines = training_outlines(trained.data, np.random.default_rng(trained.optim.seed))
     if data_hash(outlines) != card["data_sha256"]:
         raise CheckpointError(

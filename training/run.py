@@ -26,6 +26,7 @@ from training.module import PriorModule
 from training.monitor import log_figures
 from training.unseen import measure_unseen, unseen_outlines
 from training.validity import fit_mask, fit_truncated_mixture
+from training.watch import TrainingError
 
 PACKAGES = ("torch", "lightning", "numpy", "scipy", "shapely", "contourpy", "safetensors")
 ATTRIBUTION = (
@@ -54,7 +55,14 @@ def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False)
     outlines = dict(zip(prepared.names, prepared.vertices, strict=True))
     network = module.network.eval().requires_grad_(False)
     with tempfile.TemporaryDirectory(dir=out, prefix=".unmeasured-") as folder:
-        unmeasured = export_prior(network, prepared, config, Path(folder) / export.name, kept)
+        try:
+            unmeasured = export_prior(network, prepared, config, Path(folder) / export.name, kept)
+        except TrainingError as error:
+            began_with, ended_with = kept.first_loss, kept.last_loss
+            raise TrainingError(
+                f"{error} or with other rates: the loss went from {began_with:.3g} to "
+                f"{ended_with:.3g} in {kept.steps_done} steps"
+            ) from error
         return complete_card(unmeasured, outlines, config, out, export)
 
 

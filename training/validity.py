@@ -82,7 +82,9 @@ def fit_truncated_mixture(
     share = plausible[order].double().cumsum(0) / torch.arange(1, len(order) + 1)
     enough = (share >= PRECISION).nonzero()
     if not len(enough):
-        raise TrainingError("the densest latents do not decode to closed outlines; train longer")
+        raise TrainingError(
+            "the densest latents do not decode to closed outlines; train for more steps"
+        )
     floor = float(log_density[order[enough[-1, 0]]])
     many = whole.raw_sample(200_000, generator)
     density_of_many = whole.raw_log_density(many)
@@ -105,7 +107,7 @@ def without_bad_components(
     good = decodes_well(network, trials.flatten(0, 1).clamp(-1, 1))
     keep = torch.from_numpy(good.reshape(count, -1).mean(1) >= COMPONENT_SHARE)
     if not keep.any():
-        raise TrainingError("no component decodes to closed outlines; train longer")
+        raise TrainingError("no component decodes to closed outlines; train for more steps")
     weights = mixture.weights[keep] / mixture.weights[keep].sum()
     return MixtureDensity(weights, mixture.means[keep], mixture.factors[keep], -np.inf, 1.0)
 

@@ -45,6 +45,8 @@ _MISFIT = {
     "misfit_roughness_per_rad": "roughness",
 }
 """Keys of the card and the fields of `Misfit` that they hold."""
+_DENSITY = "density."
+"""How names of a density's tensors begin."""
 _REMEDY = "export it again with `python -m training.train`, or use a shipped prior"
 _NEWER = "use the version of tpcd that it was made with, or a shipped prior"
 
@@ -65,13 +67,15 @@ def load_prior(path_or_name: str | Path) -> DeepSDFShape:
     tensors = _read_tensors(folder / WEIGHTS, str(card.get("weights_sha256", "")))
     try:
         architecture = Architecture(**card["architecture"])
-        names = tuple(card["outlines"])
+        names = _names(card["outlines"])
         density_kind = DENSITIES[card["density"]]
         misfit = _misfit(card)
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(folder / CARD, f"lacks or garbles {error}", _REMEDY) from error
+    _check_tensors(architecture, len(names), tensors, folder / WEIGHTS)
     network = DeepSDFNetwork(architecture, len(names))
-    _fill(network, tensors, folder / WEIGHTS)
+    network.load_state_dict({name: tensors[name].float() for name in network.state_dict()})
+    network.requires_grad_(False).eval()
     density = _density(density_kind, tensors, architecture.latent_dim, folder / WEIGHTS)
     return DeepSDFShape(network, density, names, misfit, card)
 
@@ -125,6 +129,9 @@ def find_prior(path_or_name: str | Path) -> Path:
     """Folder of a prior given by path or by name; CheckpointError if there is none."""
     for candidate in _places(path_or_name):
         return candidate
+    given = Path(path_or_name)
+    if given.exists() and (there := _what_is(given)):
+        raise CheckpointError(given, *there)
     shipped = sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD}"))
     known = f"shipped priors are {', '.join(shipped)}" if shipped else "no priors are shipped here"
     raise CheckpointError(path_or_name, f"holds no prior ({CARD} and {WEIGHTS})", known)
@@ -180,6 +187,25 @@ def _places(path_or_name: str | Path) -> Iterator[Path]:
             yield candidate
 
 
+def _what_is(given: Path) -> tuple[str, str] | None:
+    """What a place is that holds no prior, and what to do; None where nothing is known of it."""
+    if given.is_file():
+        wanted = f"expected the folder of a prior, with {CARD} and {WEIGHTS}"
+        if given.name in (CARD, WEIGHTS):
+            return f"is a file, {wanted}", f"give {given.parent}"
+        if given.suffix == ".ckpt":
+            remedy = "give what the training exports; a stopped one goes on with --resume"
+            return f"is a checkpoint of a training, {wanted}", remedy
+        return f"is a file, {wanted}", _REMEDY
+    inside = sorted(card.parent for card in given.glob(f"*/{CARD}"))
+    if inside:
+        return f"holds no prior itself, but {len(inside)} below it", f"give {inside[0]}"
+    if any(given.glob("*.ckpt")):
+        remedy = "go on with python -m training.train --resume"
+        return "is the run of a training that has not written its prior", remedy
+    return None
+
+
 def prior_hash(path_or_name: str | Path) -> str:
     """SHA-256 of the weights of a prior given by path or by name."""
     return hashlib.sha256((find_prior(path_or_name) / WEIGHTS).read_bytes()).hexdigest()
@@ -190,7 +216,7 @@ def _read_card(path: Path) -> dict[str, Any]:
         card = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise CheckpointError(path, "is missing", _REMEDY) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(path, f"is no readable JSON ({_line(error)})", _REMEDY) from error
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise CheckpointError(path, f"is not a card of format '{FORMAT}'", _REMEDY)
@@ -205,10 +231,23 @@ def _read_card(path: Path) -> dict[str, Any]:
     return card
 
 
+def _names(outlines: object) -> tuple[str, ...]:
+    if not isinstance(outlines, list) or not outlines:
+        raise ValueError(f"'outlines' ({outlines!r}), expected a list of names")
+    strangers = [name for name in outlines if not isinstance(name, str) or not name]
+    if strangers or len(set(outlines)) < len(outlines):
+        what = f"the name {strangers[0]!r}" if strangers else "a name twice"
+        raise ValueError(f"'outlines' with {what}")
+    return tuple(outlines)
+
+
 def _misfit(card: Mapping[str, Any]) -> Misfit:
     """All but the size may be missing: nobody measured them, and they take their defaults."""
-    found = {name: float(card[key]) for key, name in _MISFIT.items() if key in card}
-    return Misfit(**found | {"sd": float(card["misfit_sd_m"])})
+    found = {name: card[key] for key, name in _MISFIT.items() if key in card}
+    for key, name in _MISFIT.items():
+        if isinstance(found.get(name), bool) or not isinstance(found.get(name, 0.0), (int, float)):
+            raise ValueError(f"'{key}' ({found[name]!r}), expected a number")
+    return Misfit(**found | {"sd": card["misfit_sd_m"]})
 
 
 def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:
@@ -217,29 +256,35 @@ def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:
         tensors = load(data)
     except FileNotFoundError as error:
         raise CheckpointError(path, "is missing", _REMEDY) from error
-    except (OSError, SafetensorError, ValueError) as error:
+    except (OSError, SafetensorError, ValueError, LookupError) as error:
         raise CheckpointError(path, f"is no safetensors file ({_line(error)})", _REMEDY) from error
     if hashlib.sha256(data).hexdigest() != expected_hash:
         raise CheckpointError(path, f"does not belong to its {CARD} (hash differs)", _REMEDY)
     return tensors
 
 
-def _fill(network: DeepSDFNetwork, tensors: dict[str, Tensor], path: Path) -> None:
-    strangers = sorted(set(tensors) - set(network.state_dict()))
-    strangers = [name for name in strangers if not name.startswith("density.")]
+def _check_tensors(
+    architecture: Architecture, codes: int, tensors: dict[str, Tensor], path: Path
+) -> None:
+    """Refuse tensors that are not those of a network of this size, or not finite."""
+    with torch.device("meta"):  # shapes alone: a card may lie about them
+        wanted = DeepSDFNetwork(architecture, codes).state_dict()
+    strangers = sorted(set(tensors) - set(wanted))
+    strangers = [name for name in strangers if not name.startswith(_DENSITY)]
     if strangers:
         raise CheckpointError(path, f"holds the tensor '{strangers[0]}' of other networks", _REMEDY)
-    for name, target in network.state_dict().items():
+    for name, target in wanted.items():
         value = tensors.get(name)
         if value is None:
             raise CheckpointError(path, f"lacks the tensor '{name}'", _REMEDY)
         if value.shape != target.shape:
-            found, wanted = tuple(value.shape), tuple(target.shape)
-            raise CheckpointError(path, f"'{name}' has shape {found}, expected {wanted}", _REMEDY)
-        if not value.isfinite().all():
+            found, expected = tuple(value.shape), tuple(target.shape)
+            raise CheckpointError(path, f"'{name}' has shape {found}, expected {expected}", _REMEDY)
+        if not value.is_floating_point():
+            kind = str(value.dtype).removeprefix("torch.")
+            raise CheckpointError(path, f"'{name}' holds {kind}, expected float32", _REMEDY)
+        if not value.float().isfinite().all():
             raise CheckpointError(path, f"'{name}' holds NaN or infinity", _REMEDY)
-    network.load_state_dict({name: tensors[name].float() for name in network.state_dict()})
-    network.requires_grad_(False).eval()
 
 
 def _density(
@@ -248,8 +293,9 @@ def _density(
     latent_dim: int,
     path: Path,
 ) -> LatentDensity:
-    prefix = "density."
-    own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    own = {k.removeprefix(_DENSITY): v for k, v in tensors.items() if k.startswith(_DENSITY)}
+    if not all(torch.isfinite(value.double()).all() for value in own.values()):
+        raise CheckpointError(path, "has a density that is not finite", _REMEDY)
     try:
         density = kind.from_tensors(own)
         dims = density.means.shape[-1] if isinstance(density, MixtureDensity) else 2
@@ -259,8 +305,6 @@ def _density(
         raise CheckpointError(
             path, f"has a density of {dims} dimensions for {latent_dim} latents", _REMEDY
         )
-    if not all(torch.isfinite(value.double()).all() for value in own.values()):
-        raise CheckpointError(path, "has a density that is not finite", _REMEDY)
     return density
 
 

@@ -27,6 +27,8 @@ from tpcd.shape.simple import one_outline
 
 UNIT = 0.1
 """Length that the networks see as 1 [m]."""
+LARGEST = {"latent_dim": 1024, "width": 16_384, "depth": 64, "points": 4096}
+"""Sizes of a decoder beyond these are a slip."""
 _ROUNDS = 100
 """Rounds at most in which latents that are not valid are drawn anew."""
 
@@ -60,6 +62,15 @@ class Architecture:
     """Hidden layers."""
     points: int = 128
     """Outline points p."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no size."""
+        for name, size in vars(self).items():
+            whole = isinstance(size, int) and not isinstance(size, bool)
+            if not whole or not 1 <= size <= LARGEST[name]:
+                raise ValueError(
+                    f"{name} is {size!r}, expected a whole number 1 to {LARGEST[name]}"
+                )
 
 
 class DeepSDFNetwork(nn.Module):

@@ -89,8 +89,13 @@ class MaskDensity:
 
     @staticmethod
     def from_tensors(tensors: dict[str, Tensor]) -> MaskDensity:
-        """Inverse of `tensors`."""
-        return MaskDensity(tensors["cells"].bool())
+        """Inverse of `tensors`; ValueError where they are no mask."""
+        cells = tensors["cells"]
+        if cells.ndim != 2 or cells.shape[0] != cells.shape[1]:
+            raise ValueError(f"'cells' of shape {tuple(cells.shape)}, expected a square")
+        if not ((cells == 0) | (cells == 1)).all() or not cells.any():
+            raise ValueError("'cells', expected 0 and 1, and one of them 1")
+        return MaskDensity(cells.bool())
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +205,19 @@ class MixtureDensity:
 
     @staticmethod
     def from_tensors(tensors: dict[str, Tensor]) -> MixtureDensity:
-        """Inverse of `tensors`."""
+        """Inverse of `tensors`; ValueError where they are no truncated mixture."""
+        weights, means, factors = (tensors[name] for name in ("weights", "means", "factors"))
+        shapes = tuple(weights.shape), tuple(means.shape), tuple(factors.shape)
+        k, z = (len(weights), means.shape[-1]) if weights.ndim and means.ndim else (0, 0)
+        if k == 0 or z == 0 or shapes != ((k,), (k, z), (k, z, z)):
+            raise ValueError(f"weights, means and factors of shapes {shapes}")
+        if not (weights > 0).all() or abs(float(weights.sum()) - 1) > 1e-6:
+            raise ValueError("'weights', expected positive numbers that sum to 1")
+        if not (factors.diagonal(dim1=-2, dim2=-1) > 0).all() or (factors.triu(1) != 0).any():
+            raise ValueError("'factors', expected lower triangles with a positive diagonal")
+        if tensors["truncation"].shape != (2,):
+            raise ValueError(f"'truncation' of {tensors['truncation'].numel()} numbers, expected 2")
         floor, kept = tensors["truncation"].tolist()
-        return MixtureDensity(tensors["weights"], tensors["means"], tensors["factors"], floor, kept)
+        if not 0 < kept <= 1:
+            raise ValueError(f"'truncation' that keeps {kept:g} of the mixture")
+        return MixtureDensity(weights, means, factors, floor, kept)

@@ -115,7 +115,105 @@ DEFECTS = {
     "holds NaN": lambda f: _edit_tensors(f, lambda t: t["decoder.0.bias"].fill_(torch.nan)),
     "'codes' has shape": lambda f: _edit_tensors(f, lambda t: t.update(codes=torch.zeros(9, 2))),
     "density tensor": lambda f: _edit_tensors(f, lambda t: t.pop("density.cells")),
+    "width is 8.5, expected a whole number": lambda f: _edit_size(f, width=8.5),
+    "depth is True, expected a whole number": lambda f: _edit_size(f, depth=True),
+    "points is 10000000000, expected 1 to 4096": lambda f: _edit_size(f, points=10**10),
+    "latent_dim is 0, expected 1 to": lambda f: _edit_size(f, latent_dim=0),
+    "has shape (8, 2), expected (16000, 2)": lambda f: _edit_size(f, width=16_000),
+    "expected depth, latent_dim, points, width": lambda f: _edit_size(f, heads=4),
+    "'outlines' ('abc'), expected a list": lambda f: _edit_card(f, outlines="abc"),
+    "'outlines' with a name twice": lambda f: _edit_card(f, outlines=["a", "a", "b"]),
+    "'outlines' with the name 3": lambda f: _edit_card(f, outlines=["a", "b", 3]),
+    "'misfit_grain' ('0.1'), expected a number": lambda f: _edit_card(f, misfit_grain="0.1"),
+    "is no readable JSON (maximum recursion": lambda f: (f / CARD).write_text("[" * 100_000),
+    "'decoder.0.bias' holds int64": lambda f: _edit_tensors(
+        f, lambda t: t.update({"decoder.0.bias": torch.zeros(8, dtype=torch.int64)})
+    ),
+    "'cells' of shape (4, 3), expected a square": lambda f: _edit_tensors(
+        f, lambda t: t.update({"density.cells": torch.ones(4, 3, dtype=torch.uint8)})
+    ),
+    "'cells', expected 0 and 1, and one of them 1": lambda f: _edit_tensors(
+        f, lambda t: t["density.cells"].zero_()
+    ),
 }
+
+
+def _edit_size(folder: Path, **changes: object) -> None:
+    size = json.loads((folder / CARD).read_text())["architecture"]
+    _edit_card(folder, architecture=size | changes)
+
+
+def _mixture() -> dict[str, torch.Tensor]:
+    eye = torch.eye(2, dtype=torch.float64)
+    return {
+        "weights": torch.tensor([0.25, 0.75], dtype=torch.float64),
+        "means": torch.zeros(2, 2, dtype=torch.float64),
+        "factors": 0.1 * eye.expand(2, 2, 2).clone(),
+        "truncation": torch.tensor([-3.0, 0.9], dtype=torch.float64),
+    }
+
+
+MIXTURES = {
+    "'weights', expected positive numbers that sum to 1": lambda t: t["weights"].mul_(2),
+    "'weights', expected positive": lambda t: t["weights"].copy_(torch.tensor([-0.5, 1.5])),
+    "weights, means and factors of shapes": lambda t: t.update(means=t["means"][:1].clone()),
+    "'factors', expected lower triangles": lambda t: t["factors"].neg_(),
+    "'truncation' of 1 numbers": lambda t: t.update(truncation=t["truncation"][:1].clone()),
+    "'truncation' that keeps 0 of the mixture": lambda t: t["truncation"][1].zero_(),
+    "has a density that is not finite": lambda t: t["means"].fill_(torch.nan),
+    "density of 3 dimensions for 2 latents": lambda t: t.update(
+        means=torch.zeros(2, 3).double(), factors=torch.eye(3).double().expand(2, 3, 3).clone()
+    ),
+}
+
+
+@pytest.mark.parametrize("message", MIXTURES)
+def test_a_mixture_that_is_none_gets_one_line(folder: Path, message: str) -> None:
+    def with_mixture(tensors: dict[str, torch.Tensor]) -> None:
+        density = _mixture()
+        MIXTURES[message](density)
+        del tensors["density.cells"]
+        tensors.update({f"density.{name}": value for name, value in density.items()})
+
+    _edit_tensors(folder, with_mixture)
+    _edit_card(folder, density="mixture")
+    with pytest.raises(CheckpointError) as caught:
+        load_prior(folder)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert str(folder / WEIGHTS) in str(caught.value)
+
+
+def test_a_mixture_comes_back(folder: Path) -> None:
+    _edit_tensors(
+        folder, lambda t: t.update({f"density.{name}": value for name, value in _mixture().items()})
+    )
+    _edit_card(folder, density="mixture")
+    draws = load_prior(folder).sample_latent(5, torch.Generator().manual_seed(0), checked=False)
+    assert draws.shape == (5, 2) and draws.isfinite().all()
+
+
+PLACES = {
+    "is a checkpoint of a training, expected the folder of a prior": "run/last.ckpt",
+    "is the run of a training that has not written its prior": "run",
+    "is a file, expected the folder of a prior, with card.json": "small/card.json",
+    "is a file, expected the folder of a prior, with card": "small/weights.safetensors",
+    "is a file, expected the folder": "notes.txt",
+    "holds no prior itself, but 1 below it": ".",
+}
+
+
+@pytest.mark.parametrize("message", PLACES)
+def test_a_place_that_holds_no_prior_is_called_what_it_is(
+    folder: Path, tmp_path: Path, message: str
+) -> None:
+    (tmp_path / "run").mkdir()
+    torch.save({"state_dict": {"a": torch.zeros(2)}}, tmp_path / "run" / "last.ckpt")
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(CheckpointError) as caught:
+        load_prior(tmp_path / PLACES[message])
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    if message.startswith("holds"):
+        assert str(caught.value).endswith(f"give {folder}")
 
 
 @pytest.mark.parametrize("message", DEFECTS)

@@ -66,7 +66,7 @@ def load_prior(path_or_name: str | Path) -> DeepSDFShape:
     card = _read_card(folder / CARD)
     tensors = _read_tensors(folder / WEIGHTS, str(card.get("weights_sha256", "")))
     try:
-        architecture = Architecture(**card["architecture"])
+        architecture = _architecture(card["architecture"])
         names = _names(card["outlines"])
         density_kind = DENSITIES[card["density"]]
         misfit = _misfit(card)
@@ -229,6 +229,16 @@ def _read_card(path: Path) -> dict[str, Any]:
             _NEWER if newer else _REMEDY,
         )
     return card
+
+
+def _architecture(sizes: object) -> Architecture:
+    names = {field.name for field in dataclasses.fields(Architecture)}
+    if not isinstance(sizes, dict) or set(sizes) != names:
+        raise ValueError(f"'architecture' ({sizes!r:.80}), expected {', '.join(sorted(names))}")
+    for name, size in sizes.items():
+        if not isinstance(size, int) or isinstance(size, bool):
+            raise ValueError(f"'architecture': {name} is {size!r}, expected a whole number")
+    return Architecture(**sizes)
 
 
 def _names(outlines: object) -> tuple[str, ...]:

@@ -66,11 +66,8 @@ class Architecture:
     def __post_init__(self) -> None:
         """Refuse what is no size."""
         for name, size in vars(self).items():
-            whole = isinstance(size, int) and not isinstance(size, bool)
-            if not whole or not 1 <= size <= LARGEST[name]:
-                raise ValueError(
-                    f"{name} is {size!r}, expected a whole number 1 to {LARGEST[name]}"
-                )
+            if not 1 <= size <= LARGEST[name]:
+                raise ValueError(f"{name} is {size}, expected 1 to {LARGEST[name]}")
 
 
 class DeepSDFNetwork(nn.Module):

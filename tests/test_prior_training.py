@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
 
 from tpcd.cli import run as run_command
@@ -15,6 +14,7 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from training.config import DataConfig, OptimConfig, TrainingConfig
 from training.evaluate import outline_errors
+from training.kept import read_kept
 from training.outlines import data_hash, mirrored, suitable, training_outlines
 from training.rates import cosine_rate, split_optimizers
 from training.train import Training, train_prior
@@ -69,6 +69,7 @@ def test_the_card_tells_what_was_done(run: Path) -> None:
     assert card["training_errors_mm"]["outline"]["mean"] < 0.8
     assert card["valid_share"] > 0.8
     assert {"torch", "numpy", "python"} <= set(card["versions"])
+    assert "learning_rates_from_step_of_steps" not in card
     outlines = training_outlines(DataConfig("builtin", only=list(NAMES)), np.random.default_rng(0))
     assert card["data_sha256"] == data_hash(outlines)
 
@@ -96,11 +97,12 @@ def test_figures_and_tensorboard_are_written(run: Path) -> None:
 
 
 def test_a_run_resumes_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # The last Lightning checkpoint of 210 steps was written at step 200.
-    saved = torch.load(run / "last.ckpt", weights_only=True)
-    assert saved["global_step"] > 0
+    assert read_kept(run / "last.ckpt")[0].steps_done == 210
     assert call(*ARGUMENTS, "--optim.steps=230", f"--out={run}", "--resume") == 0
-    assert load_prior(run / "builtin-z2").card["configuration"]["optim"]["steps"] == 230
+    card = load_prior(run / "builtin-z2").card
+    assert card["configuration"]["optim"]["steps"] == 230
+    # No training of 230 steps that was not stopped has had these learning rates.
+    assert card["learning_rates_from_step_of_steps"] == [[0, 210], [210, 230]]
 
 
 def test_a_run_of_another_network_is_not_resumed(

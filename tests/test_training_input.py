@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,15 +12,19 @@ import torch
 
 from tpcd.cli import run as run_command
 from tpcd.errors import CheckpointError, FileError
+from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import load_prior, save_prior
+from tpcd.shape.protocol import Misfit
 from training.config import DataConfig, LayoutConfig, NetworkConfig, OptimConfig, TrainingConfig
 from training.data import Prepared, prepare
+from training.evaluate import measure_prior
 from training.fitting import fit
-from training.kept import CHECKPOINT, read_kept
+from training.kept import CHECKPOINT, Kept, read_kept
 from training.layout import make_layout
 from training.measure import training_of
 from training.module import PriorModule
 from training.outlines import training_outlines
-from training.run import quoted_errors
+from training.run import quoted_errors, train
 from training.train import Training, train_prior
 from training.watch import DIVERGED, TrainingError, check_loss, check_weights
 
@@ -193,8 +198,6 @@ def test_a_loss_within_bounds_is_let_go_on() -> None:
 
 
 def test_a_prior_without_unseen_errors_is_not_quoted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from tpcd.shape.checkpoint import load_prior
-
     shape = load_prior("ycb21-z2")
     card = {key: value for key, value in shape.card.items() if key != "unseen"}
     monkeypatch.setattr("training.run.load_prior", lambda prior: replace(shape, card=card))
@@ -205,8 +208,6 @@ def test_a_prior_without_unseen_errors_is_not_quoted(monkeypatch: pytest.MonkeyP
 def test_a_card_with_settings_of_another_program_is_not_measured(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from tpcd.shape.checkpoint import load_prior
-
     shape = load_prior("ycb21-z2")
     card = {**shape.card, "configuration": {"optim": {"momentum": 3}}}
     monkeypatch.setattr(
@@ -241,3 +242,42 @@ def test_too_few_steps_are_told_with_what_the_loss_did(
     assert "the loss went from" in message and "in 3 steps" in message
     left = sorted(path.name for path in (tmp_path / "run").iterdir())
     assert left == ["config.yaml", CHECKPOINT, "tensorboard", "versions.json"]
+
+
+def test_level_sets_that_are_no_single_curve_leave_their_figures_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Regression: a prior of few steps, none of whose traced draws was one curve: IndexError."""
+    shape = load_prior("ycb21-z2")
+    outlines = {"banana": builtin_outlines()["banana"].vertices}
+    named = replace(shape, names=("banana", *shape.names[1:]))
+    monkeypatch.setattr(
+        "training.evaluate.level_set_errors",
+        lambda shape, latents: (np.zeros(0), np.full(len(latents), np.nan)),
+    )
+    monkeypatch.setattr("training.evaluate.plausible_share", lambda shape, latents: 0.0)
+    card = measure_prior(named, outlines, draws=50)
+    assert card["level_set_to_outline_mm"] is None and card["level_set_support_mm"] is None
+    assert "at 12 draws, one closed curve at 0 of them" in str(card["level_set_is"])
+    json.dumps(card, allow_nan=False)
+
+
+def test_a_prior_that_cannot_be_measured_is_not_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = load_prior("ycb21-z2")
+
+    def exported(network, prepared, config, folder: Path, kept: Kept) -> Path:
+        return save_prior(
+            folder, shipped.network, shipped.density, shipped.names, Misfit(), {"note": "x"}
+        )
+
+    def failing(*_: object) -> None:
+        raise ValueError("after 100 rounds of drawing anew")
+
+    monkeypatch.setattr("training.run.fit", lambda *_: Kept(steps_done=8))
+    monkeypatch.setattr("training.run.export_prior", exported)
+    monkeypatch.setattr("training.run.measure_prior", failing)
+    with pytest.raises(ValueError, match="100 rounds"):
+        train(CONFIG, tmp_path, tmp_path / "prior")
+    assert list(tmp_path.iterdir()) == []

@@ -163,6 +163,7 @@ def _aside(folder: Path, resumable: str | None) -> Path:
         if any((folder / name).exists() for name in names):
             shutil.rmtree(aside)
         else:
+            check_none_within(folder)
             shutil.rmtree(folder, ignore_errors=True)
             os.replace(aside, folder)
     return aside

@@ -243,6 +243,19 @@ SIMULATE = {
     "unknown effect": ({"--effects": "foo.bar=1"}, "no effect 'foo'"),
     "unit of a name": ({"--unit": "mm"}, "unit is 'mm', expected none for 'mug', which is no file"),
     "file in the way": ({"--out": "cross.csv"}, "is a file"),
+    "start turned by half": (
+        {"--start": "0 0.3 3.1"},
+        "simulate: error: --start makes an episode that cannot be, row 1 (line 3), column u_phi",
+    ),
+    "scale of a house": ({"--scale": "1000"}, "error: --scale makes an episode that cannot be"),
+    "force noise in mN": (
+        {"--noise-force": "1e9"},
+        "error: --noise_force makes an episode that cannot be, row 0 (line 2), column F_x",
+    ),
+    "two at once": (
+        {"--noise-torque": "1e6", "--noise-angle": "0.01", "--stiffness": "90 90 40"},
+        "error: --noise_torque and --stiffness make an episode that cannot be",
+    ),
 }
 
 

@@ -53,9 +53,22 @@ def system_problem(error: OSError) -> str:
     """An error of the operating system with the file in front and what to do behind."""
     if error.strerror is None:
         return " ".join(str(error).split()) or type(error).__name__
-    remedy, file = REMEDIES.get(error.errno or 0), error.filename
-    front = "" if file is None else f"{os.fsdecode(file) if isinstance(file, bytes) else file}: "
+    remedy, file = REMEDIES.get(error.errno or 0), file_of(error)
+    front = "" if file is None else f"{file}: "
     return f"{front}{error.strerror}" + (f"; {remedy}" if remedy else "")
+
+
+def file_of(error: OSError) -> str | None:
+    """The file that an error of the operating system is about, where it is known.
+
+    What closes the files of a full disk fails once more, without a name: the first error counts.
+    """
+    found: BaseException | None = error
+    while isinstance(found, OSError) and found.errno == error.errno and found.filename is None:
+        found = found.__context__
+    same = isinstance(found, OSError) and found.errno == error.errno
+    file = found.filename if same else None
+    return os.fsdecode(file) if isinstance(file, (str, bytes, os.PathLike)) else None
 
 
 def check_config_files(paths: Sequence[str]) -> None:

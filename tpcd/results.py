@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tpcd.cli_messages import REMEDIES
+from tpcd.cli_messages import REMEDIES, file_of
 from tpcd.errors import RunError
 from tpcd.files import read_json, to_plain, write_json, write_text
 from tpcd.ownership import check_none_within, is_lock, owned
@@ -118,13 +118,9 @@ def _raise_told(error: BaseException, path: str | Path, what: str) -> NoReturn:
         raise KeyboardInterrupt(f"{said}{what}") from error
     if not isinstance(error, OSError) or error.errno not in STORAGE:
         raise error
-    place, cause = error.filename, error.__context__
-    # What closes the files of a full disk fails once more, and without a name.
-    while place is None and cause is not None:
-        place, cause = getattr(cause, "filename", None), cause.__context__
     remedy = REMEDIES.get(error.errno)
     hint = f"{remedy}; {what}" if remedy else what
-    raise RunError(place or path, error.strerror or str(error), hint) from error
+    raise RunError(file_of(error) or path, error.strerror or str(error), hint) from error
 
 
 def _check_place(folder: Path) -> None:

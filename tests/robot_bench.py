@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -172,7 +173,7 @@ def wired_arm(
     controller = Controller(settings)
     if start is not None:
         controller._target = controller._actual = np.array(start)
-        controller._delayed.extend([controller._actual] * len(controller._delayed))
+        controller._delayed = deque([controller._actual] * len(controller._delayed))
         controller._load = controller._sense()
     stated = {"surface_mm_per_10n": settings.surface_mm_per_10n, **(arm or {})}
     robot = arm_on(settings, folder, **stated)

@@ -48,9 +48,8 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 def pressing(folder: Path, **stated: Any) -> tuple[UniversalRobot, Springy]:
     """An arm between two moves that presses on the floor with 1 N."""
     link = Springy(PRESSED)
-    settings = ArmSettings(
-        "springy", surface_mm_per_10n=5.0, retreat=0.003, still_time=0.3, **stated
-    )
+    stated = {"surface_mm_per_10n": 5.0, "retreat": 0.003, "still_time": 0.3, **stated}
+    settings = ArmSettings("springy", **stated)
     arm = UniversalRobot(settings, folder, lambda _: True)
     arm._link = link
     servo = Servo(settings, link, link.frame, RawRecord(), arm._guard.signals)
@@ -144,7 +143,7 @@ def test_every_call_of_a_move_may_fail_and_the_arm_is_at_rest(tmp_path: Path) ->
 
 
 def test_calls_of_a_start_may_fail_and_the_arm_is_at_rest(tmp_path: Path) -> None:
-    """The first and last of each kind, and every 61st."""
+    """The first and last of each kind, and every 299th."""
 
     def standing(folder: Path) -> tuple[UniversalRobot, Springy]:
         arm, _ = pressing(folder, origin=(0.4, 0.0, 0.1))
@@ -159,7 +158,7 @@ def test_calls_of_a_start_may_fail_and_the_arm_is_at_rest(tmp_path: Path) -> Non
     assert {"zero_sensor", "payload", "_confirm", "write_text"} < set(names)
     ends = {names.index(name) for name in set(names)}
     ends |= {len(names) - 1 - names[::-1].index(name) for name in set(names)}
-    for failing in sorted(ends | set(range(0, len(names), 61))):
+    for failing in sorted(ends | set(range(0, len(names), 299))):
         for error in errors():
             arm, link = standing(tmp_path / f"{failing}")
             counted = Counted(failing, error)
@@ -174,7 +173,7 @@ def test_calls_of_a_start_may_fail_and_the_arm_is_at_rest(tmp_path: Path) -> Non
 
 
 def test_a_disk_that_stays_full_hides_neither_the_limit_nor_itself(tmp_path: Path) -> None:
-    arm, link = pressing(tmp_path, stop_force=6.0)
+    arm, link = pressing(tmp_path, stop_force=6.0, retreat=0.01)
     counted = Counted(0, lasts=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
@@ -214,7 +213,7 @@ def test_a_second_failure_in_the_retreat_leaves_the_arm_standing_and_both_told(
     tmp_path: Path,
 ) -> None:
     for second in errors():
-        arm, link = pressing(tmp_path, stop_force=6.0)
+        arm, link = pressing(tmp_path, stop_force=6.0, retreat=0.01)
         servo = arm._guard.servo
         assert servo is not None
         patch = pytest.MonkeyPatch()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import pyarrow
 import pytest
 from made_logs import Setting, an_episode, choices_of, in_space, sampled, write_csv
+from pyarrow import csv as pyarrow_csv
 from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +19,9 @@ from tpcd.data.measured import Measured
 from tpcd.logs.columns import UNITS, log_from_columns
 from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import Log, LogError
+from tpcd.logs.suggest import suggest_map
 from tpcd.logs.table import read_columns
+from tpcd.quality.finding import Weight
 
 SETTING = Setting(
     base=Rotation.from_euler("xyz", [0.3, 0.5, 2.0]), tool=Rotation.from_euler("x", 3.0)
@@ -174,7 +178,7 @@ BAD_MAPS = {
     "half a quaternion": (without("qw"), "expected all of qx, qy, qz, qw alone"),
     "two rotations": ([*MAP, "phi=qx"], "expected all of qx, qy, qz, qw alone"),
     "no time": (without("time"), "time not in the map; the columns are t, x, y"),
-    "text": ([*without("x"), "x=word"], "column 'word' holds 'w'"),
+    "text": ([*without("x"), "x=word"], "column 'word' holds 'w' in row 0, counted from 0"),
 }
 
 
@@ -215,6 +219,280 @@ def test_time_that_goes_back_is_named(tmp_path: Path) -> None:
     table["t"][7] = 0.0
     with pytest.raises(LogError, match="time goes back from .* at row 7"):
         log_from_columns(table, MAP, tmp_path / "a.csv")
+
+
+def text_of(table: dict[str, np.ndarray], separator: str = ",", comma: bool = False) -> list[str]:
+    """The lines of a table, names first."""
+    rows = np.column_stack(list(table.values()))
+    cells = [[f"{value:.9g}" for value in row] for row in rows]
+    if comma:
+        cells = [[cell.replace(".", ",") for cell in row] for row in cells]
+    return [separator.join(row) for row in ([*table], *cells)]
+
+
+def renamed(names: list[str], lines: list[str], separator: str = ",") -> list[str]:
+    return [separator.join(names), *lines[1:]]
+
+
+def map_to(names: list[str]) -> list[str]:
+    """The map where the columns have other names, in the order of `columns`."""
+    targets = ["time", *list(columns())[1:]]
+    return [f"{target}={name}" for target, name in zip(targets, names, strict=True)]
+
+
+BLANK = ["time (s)" if name == "t" else f"TCP {name} value" for name in columns()]
+COMMA = ["t" if name == "t" else f"pose, {name}" for name in columns()]
+LAYOUTS = {
+    "names with blanks": ("\n".join(renamed(BLANK, text_of(columns()))), BLANK),
+    "names with blanks, tabs": ("\n".join(renamed(BLANK, text_of(columns(), "\t"), "\t")), BLANK),
+    "quoted commas": ("\n".join(renamed([f'"{n}"' for n in COMMA], text_of(columns()))), COMMA),
+    "blanks after commas": ("\n".join(row.replace(",", ", ") for row in text_of(columns())), None),
+    "aligned with blanks": (
+        "\n".join("  " + row.replace(" ", "    ") + " " for row in text_of(columns(), " ")),
+        None,
+    ),
+    "remarks above": ("# cell 3\n% rate 100 Hz\n\n" + "\n".join(text_of(columns())), None),
+    "text above": ("Recorded by A. Smith\nrate, 100\n" + "\n".join(text_of(columns())), None),
+    "names in a remark": ("# made by it\n# " + "\n".join(text_of(columns())), None),
+    "units below": (
+        "\n".join([text_of(columns())[0], ",".join(["s"] + ["SI"] * 20), *text_of(columns())[1:]]),
+        None,
+    ),
+    "separators at the ends": ("\n".join(row + "," for row in text_of(columns())), None),
+    "separators at the ends of rows": (
+        "\n".join([text_of(columns())[0], *(row + "," for row in text_of(columns())[1:])]),
+        None,
+    ),
+    "whole first row": (
+        "\n".join(
+            [
+                *(t := text_of(columns(), ";", True))[:1],
+                ";".join(["0"] * 7 + ["1"] + ["0"] * 6 + ["1"] + ["0"] * 6),
+                *t[2:],
+            ]
+        ),
+        None,
+    ),
+    "lines of Windows": ("\r\n".join(text_of(columns())), None),
+    "lines of old": ("\r".join(text_of(columns())), None),
+    "pipes": ("\n".join(text_of(columns(), "|")), None),
+    "remarks between": (
+        "\n".join([*text_of(columns())[:9], "# paused", *text_of(columns())[9:]]),
+        None,
+    ),
+    "cut off": ("\n".join(text_of(columns())) + "\n9.5,0.1", None),
+}
+
+
+@pytest.mark.parametrize("case", LAYOUTS)
+def test_the_layout_of_a_table_makes_no_difference(case: str, tmp_path: Path) -> None:
+    text, names = LAYOUTS[case]
+    path = tmp_path / "a.csv"
+    path.write_bytes(text.encode())
+    log = log_from_columns(read_columns(path), MAP if names is None else map_to(names), path)
+    if case == "whole first row":
+        assert np.allclose(log.positions[1:], SPACE["position"][1:], atol=1e-6)
+        assert np.allclose(log.forces[1:], SPACE["force"][1:], atol=1e-5)
+        return
+    same(log)
+    assert any("cut off in writing" in note for note in log.notes) == (case == "cut off")
+    assert any("remarks among the rows" in note for note in log.notes) == (
+        case == "remarks between"
+    )
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-32", "latin-1"])
+def test_the_encoding_of_a_table_makes_no_difference(encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(("# gemessen für Zelle 3\n" + "\n".join(text_of(columns()))).encode(encoding))
+    same(log_from_columns(read_columns(path), MAP, path))
+
+
+def test_units_are_taken_from_the_table_where_the_map_gives_none(tmp_path: Path) -> None:
+    table = columns()
+    table["x"], table["F_z"] = 1e3 * table["x"], 1e-3 * table["F_z"]
+    units = ["s", "[mm]", *["m"] * 2, *["-"] * 4, *["m"] * 3, *["1"] * 4, "N", "N", "kN"]
+    units += ["N·m", "Nm", "N*m"]
+    path = tmp_path / "a.csv"
+    lines = text_of(table)
+    path.write_text("\n".join([lines[0], ",".join(units), *lines[1:]]), encoding="utf-8")
+    log = log_from_columns(read_columns(path), MAP, path)
+    same(log)
+    assert "column 'x' is in mm by the table" in log.notes
+    path.write_text("\n".join(lines).replace("t,x,y", "t,x [mm],y").replace("F_z", "F_z (kN)"))
+    named = [*without("x", "F_z"), "x=x [mm]", "F_z=F_z (kN)"]
+    same(log_from_columns(read_columns(path), named, path))
+    # What the map says is what holds.
+    named = [*without("x", "F_z"), "x=x [mm]:m", "F_z=F_z (kN)"]
+    given = log_from_columns(read_columns(path), named, path)
+    assert np.allclose(given.positions[:, 0], 1e3 * SPACE["position"][:, 0], atol=1e-5)
+
+
+EPOCH = 1_700_000_000
+
+
+@pytest.mark.parametrize("unit", ["ns", "us", "ms"])
+@pytest.mark.parametrize("named", [True, False], ids=["unit in the map", "unit not given"])
+@pytest.mark.parametrize("kind", ["csv", "int64", "uint64", "lacking"])
+def test_whole_times_since_1970_keep_every_nanosecond(
+    unit: str, named: bool, kind: str, tmp_path: Path
+) -> None:
+    per_second = round(1 / UNITS["time"][unit])
+    times = [EPOCH * per_second + round(per_second * float(t)) for t in SPACE["time"]]
+    if unit == "ns":
+        times = [time + k % 7 for k, time in enumerate(times)]
+    table = {**columns(), "t": pyarrow.array(times, "uint64" if kind == "uint64" else "int64")}
+    if kind == "lacking":
+        table["t"] = pyarrow.array([*times[:-1], None], "int64")
+    path = tmp_path / ("a.csv" if kind == "csv" else "a.parquet")
+    (pyarrow_csv.write_csv if kind == "csv" else parquet.write_table)(pyarrow.table(table), path)
+    entries = [*without("time"), f"time=t:{unit}" if named else "time=t"]
+    log = log_from_columns(read_columns(path), entries, path)
+    since = np.array([time - times[0] for time in times]) / per_second
+    if kind == "lacking":
+        assert np.allclose(log.times, since[:-1], atol=3e-7)
+        return
+    assert np.abs(log.times - since).max() < 1e-12
+    assert any(f"is read as {unit} since 1970" in note for note in log.notes) == (not named)
+
+
+KINDS = {
+    "duration": (lambda t: pyarrow.array((1e6 * t).round().astype("int64"),
+                                         pyarrow.duration("us"))),
+    "moment": (lambda t: pyarrow.array((1e9 * t).round().astype("int64") + EPOCH * 10**9,
+                                       pyarrow.timestamp("ns", "Europe/Berlin"))),
+    "time of day": (lambda t: pyarrow.array((1e3 * t).round().astype("int32"),
+                                            pyarrow.time32("ms"))),
+    "decimal": (lambda t: pyarrow.array([Decimal(f"{v:.3f}") for v in t])),
+    "dictionary": (lambda t: pyarrow.array(t).dictionary_encode()),
+    "text": (lambda t: pyarrow.array([f" {v:.3f} " for v in t])),
+    "text of moments": (lambda t: pyarrow.array(
+        [f"2026-11-29 10:00:{v:06.3f}" for v in t])),
+    "whole": (lambda t: pyarrow.array((1e3 * t).round().astype("int32"))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_times_of_every_kind_of_parquet_are_the_same(kind: str, tmp_path: Path) -> None:
+    table = {**columns(), "t": KINDS[kind](SPACE["time"])}
+    table["half"] = pyarrow.array(np.zeros(len(SPACE["time"]), dtype=np.float16))
+    table["none"] = pyarrow.nulls(len(SPACE["time"]))
+    table["yes"] = pyarrow.array([True] * len(SPACE["time"]))
+    path = tmp_path / "a.parquet"
+    parquet.write_table(pyarrow.table(table), path)
+    entries = [*without("time", "u_qx"), "u_qx=half", f"time=t{':ms' * (kind == 'whole')}"]
+    read = read_columns(path)
+    log = log_from_columns(read, [*without("time"), entries[-1]], path)
+    same(log)
+    assert read["half"].dtype == np.float64 and read["yes"].sum() == len(SPACE["time"])
+    assert np.isnan(read["none"]).all()
+
+
+@pytest.mark.parametrize(
+    ("cell", "expected"),
+    [
+        ("err", "holds 'err' in line 9; expected numbers, or an empty cell"),
+        ("1.234,5", "holds '1.234,5' in line 9; expected numbers without marks between"),
+        ("12.3 N", "holds '12.3 N' in line 9"),
+        (
+            "0,5",
+            "holds '0,5' in line 9; expected numbers: elsewhere in the file decimals have points",
+        ),
+    ],
+)
+def test_text_among_numbers_is_named_with_its_line(
+    cell: str, expected: str, tmp_path: Path
+) -> None:
+    lines = ["# made by it", *text_of(columns(), ";")]
+    row = lines[8].split(";")
+    lines[8] = ";".join([*row[:15], cell, *row[16:]])
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    with pytest.raises(LogError) as caught:
+        log_from_columns(read_columns(path), MAP, path)
+    assert expected in str(caught.value) and "column 'F_x'" in str(caught.value)
+
+
+def test_cells_that_say_that_there_is_no_number_are_left_out_and_told(tmp_path: Path) -> None:
+    lines = text_of(columns())
+    for k, cell in enumerate(("NaN", "nan", "NA", "-", "", "inf", "null", "--", "N/A")):
+        row = lines[10 + 3 * k].split(",")
+        lines[10 + 3 * k] = ",".join([*row[:15], cell, *row[16:]])
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    log = log_from_columns(read_columns(path), MAP, path)
+    assert len(log) == len(SPACE["time"]) - 9
+    assert log.notes[0].endswith("rows lack a number and are left out (F_x; first in line 11)")
+
+
+def test_text_far_down_is_found_as_well(tmp_path: Path) -> None:
+    # Beyond the rows on which the kind of a column is found.
+    lines = ["t,x,z,F_x,F_z"] + [f"{k / 100},0.1,0.2,{k % 7}.25,0.5" for k in range(60_000)]
+    lines[50_001] = "500,0.1,0.2,overload,0.5"
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    entries = ["time=t", "x=x", "z=z", "F_x=F_x", "F_z=F_z"]
+    with pytest.raises(LogError, match="column 'F_x' holds 'overload' in line 50002"):
+        log_from_columns(read_columns(path), entries, path)
+
+
+def test_a_column_that_is_empty_for_seconds_is_a_gap_and_so_are_rows_that_stop(
+    tmp_path: Path,
+) -> None:
+    table = columns()
+    table["F_x"] = table["F_x"].copy()
+    table["F_x"][300:420] = np.nan
+    stopped = {name: np.delete(column, np.arange(500, 620)) for name, column in table.items()}
+    log = log_from_columns(stopped, MAP, tmp_path / "a.csv")
+    gaps = {(g.start, g.end) for g in log.findings if g.weight is Weight.LEFT_OUT}
+    times = SPACE["time"]
+    expected = {(times[299], times[420]), (times[499], times[620])}
+    assert {tuple(np.round(g, 6)) for g in gaps} == {tuple(np.round(g, 6)) for g in expected}
+    assert len(log) == len(times) - 240
+
+
+def test_streams_in_rows_of_their_own_are_joined_by_their_times(tmp_path: Path) -> None:
+    # As exports of bags put them: each message a row, empty where the others are.
+    table, count = columns(), len(SPACE["time"])
+    late = {name: np.full(2 * count, np.nan) for name in table}
+    pose = [n for n in table if n[0] in "xyzqu"]
+    for name, column in table.items():
+        if name == "t":
+            late[name][0::2], late[name][1::2] = column, column + 0.003
+        elif name in pose:
+            late[name][0::2] = column
+        else:
+            late[name][1::2] = column
+    log = log_from_columns(late, MAP, tmp_path / "a.csv")
+    assert len(log) == count - 1 and any("joined by their times" in note for note in log.notes)
+    expected = 0.7 * SPACE["force"][9] + 0.3 * SPACE["force"][8]
+    assert np.allclose(log.forces[8], expected, atol=1e-3)
+
+
+def test_without_a_map_the_columns_are_listed_and_a_map_is_suggested(tmp_path: Path) -> None:
+    names = ["Timestamp (s)", "TCP_Pos_X", "TCP_Pos_Y", "TCP_Pos_Z", "orientation.x",
+             "orientation.y", "orientation.z", "orientation.w"]  # fmt: skip
+    names += [f"desired_pose_{n}" for n in "xyz"] + [f"target_quat_{n}" for n in "xyzw"]
+    names += [f"wrench.force.{n}" for n in "xyz"] + [f"Mom{n}" for n in "XYZ"]
+    named = dict(zip(names, columns().values(), strict=True))
+    with pytest.raises(LogError) as caught:
+        log_from_columns(named, (), tmp_path / "a.csv")
+    told = str(caught.value)
+    assert "F_x, F_z, time, x, z not in the map; the columns are 'Timestamp (s)', TCP_Pos_X" in told
+    tried = [entry.strip("'") for entry in suggest_map(named)]
+    assert "--map " + " ".join(suggest_map(named)) in told
+    same(log_from_columns(named, [*tried, *(f"T_{n.lower()}=Mom{n}" for n in "XYZ")],
+                          tmp_path / "a.csv"))  # fmt: skip
+
+
+def test_a_table_of_streams_with_other_clocks_is_mended_on_request(tmp_path: Path) -> None:
+    table, late = columns(), 30
+    for name in ("F_x", "F_y", "F_z", "T_x", "T_y", "T_z"):
+        table[name] = np.concatenate((np.full(late, table[name][0]), table[name][:-late]))
+    log = log_from_columns(table, MAP, tmp_path / "a.csv", delays={"wrench": late / 100})
+    count = len(log)
+    assert np.allclose(log.forces[:, 0], SPACE["force"][:count, 0], atol=1e-3)
+    assert any(each.kind == "moved" for each in log.findings)
 
 
 def measured_folder() -> Path:

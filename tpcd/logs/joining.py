@@ -131,6 +131,7 @@ def join(
 
 def _turning(stream: Stream) -> tuple[Stream, str]:
     """The stream without its quaternions of length 0, which are no rotation, and what is told."""
+    stream = replace(stream, values=np.where(np.isfinite(stream.values), stream.values, np.nan))
     names = [name.removeprefix("u_") for name in stream.channels]
     places = [names.index(name) for name in ROTATIONS["quaternion"] if name in names]
     if len(places) < 4:

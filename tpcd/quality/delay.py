@@ -31,13 +31,16 @@ STEPS = {"wrench": 0.02, "command": 0.05}
 BLOCKS = 10
 SAMPLES = 4000
 """So many moments of the recording are enough."""
-SPAN = 0.04
-"""Velocities are differences over this, so that noise of single samples counts little [s]."""
+SPAN = 0.05
+"""All is averaged over this to either side, and velocities are differences over it, so that noise
+of single samples counts little [s]; an average of all three obeys what they obey."""
 HARMLESS = {"wrench": 0.1, "command": 0.15}
 """Less than this is told and not doubted [s]: filters of a sensor take some 10 ms, those that a
 controller puts before its set point some 100 ms."""
 WIDE = 0.12
 """An interval that reaches further than this to either side tells nothing [s]."""
+CLEAR = 0.05
+"""Where the best delays leave not even this part less than others do, there is nothing to tell."""
 Samples = tuple[Float[np.ndarray, " _"], Float[np.ndarray, "_ _"]]
 
 
@@ -51,12 +54,14 @@ class Delay:
     low: float
     high: float
     """Two standard errors to either side."""
+    gain: float
+    """Part of what most delays leave of the wrench that this one explains."""
 
     @property
     def known(self) -> bool:
         """Whether the data tell it."""
         inside = abs(self.value) < REACH - 2 * STEPS[self.of]
-        return inside and self.high - self.low < 2 * WIDE
+        return inside and self.high - self.low < 2 * WIDE and self.gain > CLEAR
 
     @property
     def doubtful(self) -> bool:
@@ -104,10 +109,10 @@ def estimate_delays(streams: Sequence[Stream]) -> tuple[Delay, ...]:
     best = _lowest(left[0], lags)
     without = np.array([_lowest(each, lags) for each in left[1:]])
     error = np.sqrt((BLOCKS - 1) / BLOCKS * ((without - without.mean(0)) ** 2).sum(0))
-    found = []
+    found, gain = [], 1.0 - float(left[0].min() / np.median(left[0]))
     for k, (of, step) in enumerate(STEPS.items()):
         wide = 2 * float(np.hypot(error[k], step / np.sqrt(12.0)))
-        found.append(Delay(of, best[k], best[k] - wide, best[k] + wide))
+        found.append(Delay(of, best[k], best[k] - wide, best[k] + wide, gain))
     return tuple(found)
 
 
@@ -161,7 +166,7 @@ def _lowest(
 
 def _moments(pose: Samples, wrench: Samples) -> Float[np.ndarray, " s"]:
     """Where to compare: evenly over what both span, apart from gaps, with room for every delay."""
-    room = REACH + SPAN
+    room = REACH + 3 * SPAN
     first, last = max(pose[0][0], wrench[0][0]) + room, min(pose[0][-1], wrench[0][-1]) - room
     times = np.linspace(first, last, int(np.clip((last - first) / 0.01, 0, SAMPLES)))
     for start, end in np.concatenate((find_gaps(pose[0]), find_gaps(wrench[0]))).tolist():
@@ -188,11 +193,33 @@ def _numbers(stream: Stream) -> Samples:
 
 
 def _between(samples: Samples, times: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s w"]:
-    return np.stack([np.interp(times, samples[0], column) for column in samples[1].T], axis=1)
+    """Averages of values on straight lines, over `SPAN` to either side."""
+    own, values = samples
+    steps = 0.5 * np.diff(own)[:, None] * (values[1:] + values[:-1])
+    return _mean(own, steps, values[-1], times)
 
 
 def _held(samples: Samples, times: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s w"]:
-    return samples[1][np.maximum(np.searchsorted(samples[0], times, side="right") - 1, 0)]
+    """Averages of values that hold until the next one comes, over `SPAN` to either side."""
+    own, values = samples
+    return _mean(own, np.diff(own)[:, None] * values[:-1], values[-1], times)
+
+
+def _mean(
+    own: Float[np.ndarray, " k"],
+    steps: Float[np.ndarray, "j w"],
+    last: Float[np.ndarray, " w"],
+    times: Float[np.ndarray, " s"],
+) -> Float[np.ndarray, "s w"]:
+    """Averages from the integrals over the spacings of samples, beyond which the last one holds."""
+    far = max(float(times[-1]) + 2 * SPAN, own[-1] + 1.0) if len(times) else own[-1] + 1.0
+    knots = np.append(own, far)
+    integral = np.cumsum(np.vstack((0 * last, steps, (far - own[-1]) * last)), axis=0)
+    late, early = (
+        np.stack([np.interp(times + by, knots, column) for column in integral.T], axis=1)
+        for by in (SPAN, -SPAN)
+    )
+    return (late - early) / (2 * SPAN)
 
 
 def _design(parts: list[Float[np.ndarray, "s _"]]) -> Float[np.ndarray, "s r"]:

@@ -205,5 +205,6 @@ def test_what_jams_on_rigid_terrain_is_answered_beside_terrain_that_yields() -> 
         simulate_step(scene, start, command, STIFFNESS, ONCE, engine=e) for e in ("native", "torch")
     )
     assert found.status.tolist() == other.status.tolist()
-    assert found.status.tolist() == [StepStatus.RELAXED, StepStatus.CONVERGED]
+    # It starts 10 mm inside both walls.
+    assert found.status.tolist() == [StepStatus.RELAXED, StepStatus.START_INSIDE]
     torch.testing.assert_close(found.pose, other.pose)

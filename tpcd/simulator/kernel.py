@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from tpcd.qp import compiled, problem
-from tpcd.simulator import events, implicit, loaded, settle, walk, wedge
+from tpcd.simulator import events, implicit, loaded, record, settle, walk, wedge
 from tpcd.simulator.kernel_element import step_element
 from tpcd.simulator.kernel_geometry import World, new_chains
 from tpcd.simulator.kernel_request import new_planes, own_law, prepare, set_planes, set_stiffness
@@ -34,7 +34,7 @@ def source_stamp(*more: ModuleType) -> int:
     """
     digest = hashlib.sha256()
     parts = [part for name, part in sorted(sys.modules.items()) if name.startswith(__name__)]
-    others = (compiled, problem, events, implicit, loaded, settle, walk, wedge)
+    others = (compiled, problem, events, implicit, loaded, record, settle, walk, wedge)
     for module in (*parts, *others, *more):
         digest.update(Path(str(module.__file__)).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")

@@ -15,7 +15,16 @@ from tpcd.simulator.kernel_geometry import first_touch, touching
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system
 from tpcd.simulator.kernel_request import sound, wrap
-from tpcd.simulator.kernel_settle import CONVERGED, INVALID, JAMMED, RELAXED, settle
+from tpcd.simulator.kernel_rest import depth_inside, distance_from_rest
+from tpcd.simulator.kernel_settle import (
+    CONVERGED,
+    INVALID,
+    JAMMED,
+    NOT_CONVERGED,
+    RELAXED,
+    START_INSIDE,
+    settle,
+)
 from tpcd.simulator.kernel_slopes import (
     append_part,
     append_theta,
@@ -34,6 +43,7 @@ from tpcd.simulator.kernel_walk import (
     sticking,
 )
 from tpcd.simulator.kernel_wedge import may_wedge
+from tpcd.simulator.record import REST_TOLERANCE, START_DEPTH
 from tpcd.simulator.walk import (
     AIM,
     ALMOST,
@@ -92,8 +102,10 @@ def step_element(
     rested, parts, straight = request.rested, 1, CONVERGED
     modes, status, residual, relaxed = 0, CONVERGED, 0.0, False
     stage, done, length, spent = (STRAIGHT if rested else RESTING), 0.0, 1.0, 0
-    kind, seeks, moving, ahead = TRY, False, False, np.inf
+    kind, seeks, moving, ahead, inside = TRY, False, False, np.inf, False
     if rested:
+        space.load[:] = 0.0
+        inside = depth_inside(world, o, chains, pose, space.load) > START_DEPTH
         modes = sticking(touching(world, o, chains, pose), terrains)
         _keep(slopes, pose, kept_pose, height, entries)
     while True:
@@ -166,6 +178,11 @@ def step_element(
             landing_response(world, o, start, part, fraction, point, terrain, slopes)
             turn = (math.cos(pose[2]), math.sin(pose[2]))
             linear_system(world, o, law, part, pose, turn, space)
+            if share == 1.0:
+                off = distance_from_rest(world, o, chains, law, extent, pose, turn, space)
+                residual = max(residual, off)
+                if off > REST_TOLERANCE * law.tolerance:
+                    status = max(status, NOT_CONVERGED)
             settling_response(law, terrains, space, slopes)
             if stage == WALKING and share < 1.0:
                 ahead, event = next_event(
@@ -189,6 +206,8 @@ def step_element(
                 for t in range(terrains):
                     world.friction[o, t] = space.friction[t]
         if stage == RESTING:
+            if fraction == 0.0:
+                inside = depth_inside(world, o, chains, landing, space.load) > START_DEPTH
             modes, status, residual, stage = now, CONVERGED, 0.0, STRAIGHT
             _keep(slopes, pose, kept_pose, height, entries)
         elif stage == STRAIGHT:
@@ -211,6 +230,8 @@ def step_element(
             _restore(slopes, pose, kept_pose, height, entries)
         else:
             break
+    if status == CONVERGED and inside:
+        status = START_INSIDE
     for a in range(3):
         answer.poses[b, a] = pose[a]
     for t in range(terrains):

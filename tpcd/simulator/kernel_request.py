@@ -10,6 +10,7 @@ import numpy as np
 from tpcd.simulator.kernel_geometry import build_chains
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_space import Law
+from tpcd.simulator.record import LARGEST_FRICTION
 from tpcd.simulator.settle import PROBE_ANGLE
 
 
@@ -113,10 +114,11 @@ def _reach(world, o):
 @inner
 @no_type_check
 def sound(world, o, law):
-    """Whether planes and stiffness are finite, and the stiffness positive."""
+    """Whether planes and stiffness are finite, friction within bounds and stiffness positive."""
     total = 0.0
     for t in range(world.normals.shape[1]):
-        total += abs(world.offsets[o, t]) + abs(world.friction[o, t])
+        rough = world.friction[o, t]
+        total += abs(world.offsets[o, t]) + (0.0 if 0.0 <= rough <= LARGEST_FRICTION else np.inf)
         total += world.compliance[o, t] if world.compliance[o, t] >= 0.0 else np.inf
         total += abs(world.normals[o, t, 0]) + abs(world.normals[o, t, 1])
     for a in range(3):

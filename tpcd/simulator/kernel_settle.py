@@ -21,13 +21,16 @@ from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_linear import linear_system, respond
 from tpcd.simulator.kernel_space import LIST
 from tpcd.simulator.loaded import SLIGHT
+from tpcd.simulator.record import StepStatus
 from tpcd.simulator.settle import NEWTON_ROUNDS, PROBE_ANGLE
 from tpcd.simulator.wedge import PATIENCE
 
 NEAR = 1e-4
 """A terrain further away than this is no candidate under Coulomb friction [m]."""
-CONVERGED, NOT_CONVERGED, RELAXED, INVALID = 0, 1, 2, 3
-JAMMED = 4
+CONVERGED, START_INSIDE = int(StepStatus.CONVERGED), int(StepStatus.START_INSIDE)
+NOT_CONVERGED, RELAXED = int(StepStatus.NOT_CONVERGED), int(StepStatus.RELAXED)
+INVALID = int(StepStatus.INVALID_INPUT)
+JAMMED = INVALID + 1
 """Jammed even without friction, which is left to the torch path."""
 _SOLVED = int(Status.SOLVED)
 
@@ -51,6 +54,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
     status, residual = NOT_CONVERGED, np.inf
     rounds = law.rounds if afresh else PATIENCE * law.rounds
     start_turn = (math.cos(start[2]), math.sin(start[2]))
+    still = law.tolerance / _roughest(world, o, law)
     for k in range(rounds):
         turn = (math.cos(pose[2]), math.sin(pose[2]))
         _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, space)
@@ -66,7 +70,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
             pose[a] = target
         turn = (math.cos(pose[2]), math.sin(pose[2]))
         _choose(world, o, law, pose, turn, space)
-        if residual <= law.tolerance:
+        if residual <= still:
             status = CONVERGED
             break
         if k < NEWTON_ROUNDS and linear_system(world, o, law, command, pose, turn, space):
@@ -81,6 +85,18 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh):
                 for a in range(3):
                     pose[a] += step[a]
     return status, residual
+
+
+@inner
+@no_type_check
+def _roughest(world, o, law):
+    """Times what a point slips in a round that Coulomb friction may lift it in the next one, or 1
+    where that is less."""
+    largest = 1.0
+    if law.coulomb:
+        for t in range(world.normals.shape[1]):
+            largest = max(largest, world.friction[o, t])
+    return largest
 
 
 @inner(forceinline=True)

@@ -22,7 +22,7 @@ from tpcd.contact import ContactScene, place_points
 from tpcd.loops import available
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
-from tpcd.simulator.record import DEGREES, StepSettings, Transition
+from tpcd.simulator.record import DEGREES, StepSettings, StepStatus, Transition
 from tpcd.terrain import HalfPlane
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tpcd.simulator.kernel_request import Request
     from tpcd.simulator.kernel_space import Law
 
-JAMMED = 4
+JAMMED = int(StepStatus.INVALID_INPUT) + 1
 """Status of an element that the compiled loops leave to the torch path."""
 CHUNK = 64
 """Fewest transitions handed to a thread at once."""

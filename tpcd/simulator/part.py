@@ -14,7 +14,14 @@ from tpcd.simulator.events import next_event
 from tpcd.simulator.flight import Flight, first_touch, touch_row
 from tpcd.simulator.implicit import LinearResponse, linear_response, loaded_frames, newton_step
 from tpcd.simulator.loaded import slide
-from tpcd.simulator.record import ContactMode, ContactSet, StepSettings, StepStatus
+from tpcd.simulator.record import (
+    REST_TOLERANCE,
+    ContactMode,
+    ContactSet,
+    StepSettings,
+    StepStatus,
+)
+from tpcd.simulator.rest import distance_from_rest
 from tpcd.simulator.settle import Settled
 from tpcd.simulator.wedge import settle
 
@@ -139,6 +146,11 @@ def advance(
     pose, multiplier = newton_step(*arguments)
     free, stands = flight.fraction >= 1, ~settled.yielding[:, None]
     pose = torch.where(free[:, None], target, pose).where(stands, settled.pose)
+    held = replace(settled.contacts, multiplier=multiplier.detach().clamp_min(0.0))
+    off = distance_from_rest(scene, pose, target, stiffness, held, settings)
+    ends = (part.share == 1) & ~free
+    unrest = ends & (off > REST_TOLERANCE * settings.tolerance)
+    reached = torch.where(unrest, int(StepStatus.NOT_CONVERGED), int(StepStatus.CONVERGED))
     loose = free | settled.yielding
     pose, response, ahead, passes, passed = _pass_on(
         scene, part, pose, settled.contacts, multiplier, response, loose
@@ -158,8 +170,8 @@ def advance(
         contacts=_contact_forces(scene, settled),
         mode=_contact_modes(settled, len(scene.terrains)),
         slid=slide(scene, landing.detach(), settled.pose, settled.contacts, settings.tolerance),
-        status=torch.maximum(state.status, settled.status),
-        residual=torch.maximum(state.residual, settled.residual),
+        status=state.status.maximum(settled.status).maximum(reached),
+        residual=state.residual.maximum(settled.residual).maximum(torch.where(ends, off, 0.0)),
         ahead=ahead,
         passes=passes,
         passed=passed,

@@ -14,7 +14,14 @@ from tpcd.planar import wrap_angle
 from tpcd.simulator.flight import FREE_GAP
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.part import Part, State, advance, start_state, whole
-from tpcd.simulator.record import ContactMode, StepSettings, Transition
+from tpcd.simulator.record import (
+    START_DEPTH,
+    ContactMode,
+    StepSettings,
+    StepStatus,
+    Transition,
+)
+from tpcd.simulator.rest import terrain_gaps_under
 from tpcd.simulator.settle import own
 from tpcd.simulator.walk import (
     AIM,
@@ -61,6 +68,7 @@ def follow_path(
             status=torch.zeros_like(begin.status),
             residual=torch.zeros_like(begin.residual),
         )
+    inside = -terrain_gaps_under(scene, start, begin.contacts[..., 0].detach()).amin(-1)
     at_once = whole(path_start, command, rested)
     end = advance(scene, begin, at_once, stiffness, settings)
     turn = (command - path_start)[:, 2].detach()
@@ -69,11 +77,12 @@ def follow_path(
         seeks = ~ends_alike(begin.mode, end.mode, end.slid)
         walked = _walk(scene, begin, path_start, command, parts, seeks, rested, stiffness, settings)
         end = walked.where((parts > 1) & (walked.status <= end.status), end)
+    pushed = (inside > START_DEPTH) & (end.status == int(StepStatus.CONVERGED))
     return Transition(
         pose=torch.cat((end.pose[:, :2], wrap_angle(end.pose[:, 2:])), dim=-1),
         wrench=stiffness * (end.pose - command),
         mode=end.mode,
-        status=end.status,
+        status=torch.where(pushed, int(StepStatus.START_INSIDE), end.status),
         residual=end.residual,
         pose_from_start=end.from_start,
         pose_from_gap=end.from_gap,

@@ -21,15 +21,33 @@ LEAST_FINEST = 1e-6
 """Shorter parts cannot be told from rounding."""
 MOST_PARTS = 100_000
 """Parts of equal length that a path may be cut into."""
+LARGEST_FRICTION = 100.0
+"""Largest friction coefficient. Nothing slips there unless it is pulled within half a degree along
+the terrain; with more, rounding decides which of the rows of a contact holds."""
+START_DEPTH = 1e-3
+"""A start pose further inside a terrain than this [m] is no error of a measurement."""
+REST_TOLERANCE = 10.0
+"""Times the tolerance that an answer may be from rest, in the words of `Transition.residual`. Where
+it came to rest in rounds, that is at most once the tolerance."""
 
 
 class StepStatus(IntEnum):
-    """How the quasi-static step of one element ended."""
+    """How the quasi-static step of one element ended, the better the lower; up to `RELAXED` there
+    is an answer."""
 
     CONVERGED = 0, "converged"
-    NOT_CONVERGED = 1, "the iterations did not settle; raise rounds or substeps"
-    RELAXED = 2, "jammed: no motion satisfies contact with friction; answered without friction"
-    INVALID_INPUT = 3, "the pose, command or scene holds a NaN or an infinity"
+    START_INSIDE = (
+        1,
+        f"converged, but the start pose is more than {1e3 * START_DEPTH:g} mm inside a terrain, out"
+        " of which the object was pushed first; check the frame and the unit of the pose",
+    )
+    NOT_CONVERGED = 2, "the answer is not at rest, see its residual; raise rounds or substeps"
+    RELAXED = 3, "jammed: no motion satisfies contact with friction; answered without friction"
+    INVALID_INPUT = (
+        4,
+        "the pose, command or scene holds a NaN or an infinity, or a friction that is not from 0 to"
+        f" {LARGEST_FRICTION:g}",
+    )
 
     sentence: str
 
@@ -72,7 +90,8 @@ class StepSettings:
     rounds: int = 20
     """Cap on re-linearisations of geometry and friction in one substep."""
     tolerance: float = 1e-7
-    """A substep has settled when a round moves no point by more than this [m]."""
+    """A substep has settled when a round moves no point, and no friction a gap, by more than this
+    [m]."""
 
     def __post_init__(self) -> None:
         """Refuse settings that mean nothing."""
@@ -115,7 +134,9 @@ class Transition:
 
     `pose` (x, z, angle) [m, m, rad]; `wrench` (F_x, F_z, torque) [N, N, N·m] that the world
     exerts on the object about the end-effector origin; `mode` the `ContactMode` against each
-    terrain; `residual` the largest remaining motion of the last round [m].
+    terrain; `residual` how far the answer is from rest [m]: the largest of what the last round
+    moved, how deep the object is inside a terrain, how far from one under Coulomb friction whose
+    load it bears, and how far the arm would still go for what its forces do not balance.
     """
 
     pose: Float[Tensor, "*batch 3"]

@@ -86,6 +86,9 @@ def settle_from(
     rows = DEGREES + (terrains if bool(scene.yields.any()) else 0)
     contacts = no_contacts(count, rows, start) if sought is None else sought.contacts
     extent = scene.points_ee.norm(dim=-1).amax(-1)
+    # What a point slips in a round, Coulomb friction may lift it in the next one.
+    rough = scene.friction.amax(-1).clamp_min(1.0) if settings.friction == "coulomb" else 1.0
+    still = settings.tolerance / rough * torch.ones_like(extent)
     running = torch.arange(count, device=device)
     part = scene
     for k in range(settings.rounds):
@@ -101,7 +104,7 @@ def settle_from(
         put_contacts(contacts, running, found)
         change = _motion(step, extent[running])
         residual[running] = change
-        settled = (change <= settings.tolerance) & ~relaxed
+        settled = (change <= still[running]) & ~relaxed
         if k < NEWTON_ROUNDS:
             polished, _ = newton_step(
                 part,

@@ -17,7 +17,13 @@ from tpcd.contact import ContactScene
 from tpcd.simulator import native
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.path import follow_path
-from tpcd.simulator.record import ContactMode, StepSettings, StepStatus, Transition
+from tpcd.simulator.record import (
+    LARGEST_FRICTION,
+    ContactMode,
+    StepSettings,
+    StepStatus,
+    Transition,
+)
 from tpcd.simulator.settle import own
 from tpcd.terrain import HalfPlane
 
@@ -209,6 +215,7 @@ def _step_finite(
         for value in given:
             finite = finite & torch.isfinite(value).all(-1)
         finite = finite & ((scene.compliance >= 0) & (scene.compliance < torch.inf)).all(-1)
+        finite = finite & ((scene.friction >= 0) & (scene.friction <= LARGEST_FRICTION)).all(-1)
     if bool(finite.all()):
         return follow_path(scene, start, previous, command, stiffness, settings)
     index = torch.nonzero(finite).flatten()

@@ -1,0 +1,182 @@
+"""A good status is true: what is called converged is at rest, whatever was asked."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from contact_scenes import (
+    BOX,
+    OUTLINES,
+    STIFFNESS,
+    make_scene,
+    many_random_transitions,
+    outline_points,
+    vector,
+)
+from simulator_steps import ENGINES, FRICTIONS
+from torch import Tensor
+
+from tpcd.contact import ContactScene, terrain_gaps
+from tpcd.planar import transform_points
+from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
+from tpcd.simulator.record import LARGEST_FRICTION, START_DEPTH
+from tpcd.simulator.rest import distance_from_rest
+from tpcd.simulator.settle import settle_from
+
+DEPTH = 1e-6
+"""What is converged is no deeper inside a terrain than this [m], ten times the tolerance."""
+
+
+def rough(scene: ContactScene, friction: float) -> ContactScene:
+    return replace(scene, friction=torch.full_like(scene.friction, friction))
+
+
+def depth(scene: ContactScene, found: Transition) -> Tensor:
+    """How deep the answers are inside terrains that have yielded to their load [m]."""
+    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, found.pose)
+    return -(gaps.amin(-1) + scene.compliance * found.contacts[..., 0]).amin(-1)
+
+
+@ENGINES
+@FRICTIONS
+@pytest.mark.parametrize("friction", [1e3, 1e5, 1e6, 1e8, math.inf, -0.1])
+def test_friction_beyond_its_bounds_has_no_answer_and_names_them(engine, friction_law, friction):
+    scene, start, command = many_random_transitions(5, 0)
+    settings = StepSettings(friction=friction_law)
+    found = simulate_step(rough(scene, friction), start, command, STIFFNESS, settings, engine)
+    assert (found.status == StepStatus.INVALID_INPUT).all() and found.pose.isnan().all()
+    assert f"0 to {LARGEST_FRICTION:g}" in StepStatus.INVALID_INPUT.sentence
+
+
+@ENGINES
+@FRICTIONS
+@pytest.mark.parametrize("friction", [1.0, 10.0, 30.0, LARGEST_FRICTION])
+def test_what_is_converged_is_outside_of_all_terrain_however_rough_it_is(
+    engine, friction_law, friction
+):
+    """Also where the settings say that all is gone at once: then nothing else is the answer."""
+    scene, start, command = many_random_transitions(25 if engine == "native" else 1, 0)
+    scene = rough(scene, friction)
+    whole = StepSettings(friction=friction_law, substeps=1)
+    for settings in (replace(whole, substeps=2), whole)[engine == "torch" :]:
+        found = simulate_step(scene, start, command, STIFFNESS, settings, engine)
+        converged = found.status == StepStatus.CONVERGED
+        assert float(converged.double().mean()) > 0.2
+        assert float(depth(scene, found)[converged].max()) <= DEPTH
+        assert float(found.residual[converged].max()) <= DEPTH
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_converged_is_at_rest_at_any_stiffness_size_angle_and_distance(seed):
+    """Springs of 1e-3 to 1e9, outlines of 10 um to 10 m, turns of 1e6 rad, ways of 100 m, starts
+    inside and outside, terrain that yields: no depth, no force outside of the friction cone, and a
+    wrench that is the sum of the forces."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    def log(low: float, high: float, *shape: int) -> Tensor:
+        return torch.exp(uniform(math.log(low), math.log(high), *shape))
+
+    n, good = 400, 0
+    for name in OUTLINES:
+        points = log(1e-4, 1e2, n)[:, None, None] * outline_points(name)
+        extent = points.norm(dim=-1).amax(-1)
+        few = uniform(0, 1, n) < 0.5
+        scene = make_scene(
+            points,
+            torch.where(few, log(1e-3, LARGEST_FRICTION, n), 0.5),
+            uniform(-0.02, 0.02, n),
+            uniform(-0.05, 0.2, n),
+            torch.where(uniform(0, 1, n) < 0.3, log(1e-9, 1e-2, n), 0.0)[:, None],
+        )
+        angle = torch.where(uniform(0, 1, n) < 0.2, uniform(-1e6, 1e6, n), uniform(-3, 3, n))
+        turned = transform_points(torch.stack((0 * angle, 0 * angle, angle), -1), points)
+        inside = uniform(-0.5, 0.2, n, 2) * extent[:, None]
+        place = torch.stack(
+            (
+                -scene.terrains[1].offset - turned[..., 0].amax(-1) + inside[:, 0],
+                scene.terrains[0].offset - turned[..., 1].amin(-1) - inside[:, 1],
+            ),
+            -1,
+        )
+        start = torch.cat((place, angle[:, None]), -1)
+        far = torch.where(uniform(0, 1, n) < 0.2, 100.0, 2.0 * extent)[:, None]
+        turn = torch.where(uniform(0, 1, n) < 0.2, 1e6, 0.5)[:, None]
+        move = torch.cat((far * uniform(-1, 1, n, 2), turn * uniform(-1, 1, n, 1)), -1)
+        stiffness = torch.where(few[:, None], log(1e-3, 1e9, n, 3), STIFFNESS)
+        command = start + move
+        found = simulate_step(scene, start, command, stiffness)
+        true = found.status <= StepStatus.START_INSIDE
+        good += int(true.sum())
+        assert torch.isfinite(found.pose[true]).all() and torch.isfinite(found.wrench[true]).all()
+        assert float(depth(scene, found)[true].max()) <= DEPTH
+        load, drag = found.contacts[..., 0], found.contacts[..., 1]
+        assert (load[true] >= 0).all()
+        cone = drag.abs() - scene.friction * load
+        assert (cone <= 1e-9 * load)[true].all()
+        normals = torch.stack([body.direction for body in scene.terrains], -2)
+        along = torch.stack((normals[..., 1], -normals[..., 0]), -1)
+        force = (load[..., None] * normals + drag[..., None] * along).sum(-2)
+        # Forces of springs that differ a millionfold cancel to what rounding leaves of the largest.
+        rounding = 1e-12 * load.sum(-1, keepdim=True) / stiffness[:, :2]
+        off = (found.wrench[:, :2] - force).abs() / stiffness[:, :2]
+        assert (off <= 10 * DEPTH + rounding)[true].all()
+    assert good > 0.7 * n * len(OUTLINES)
+
+
+@ENGINES
+@pytest.mark.parametrize("previous", [None, vector(0.0, 0.05, 0.0)])
+def test_a_start_inside_a_terrain_is_told_unless_a_measurement_may_be_that_wrong(engine, previous):
+    inside = vector(0.9 * START_DEPTH, 1.1 * START_DEPTH, 0.03)
+    start = vector(0, 0.05, 0) - inside[:, None] * vector(0, 1, 0)
+    command = vector(0, 0.04, 0)
+    found = simulate_step(
+        make_scene(BOX), start, command, STIFFNESS, engine=engine, previous=previous
+    )
+    assert found.status.tolist() == [
+        StepStatus.CONVERGED,
+        StepStatus.START_INSIDE,
+        StepStatus.START_INSIDE,
+    ]
+    torch.testing.assert_close(found.pose[:, 1], vector(0.05, 0.05, 0.05))
+    assert "inside a terrain" in StepStatus.START_INSIDE.sentence
+
+
+@ENGINES
+def test_an_object_that_a_soft_floor_has_yielded_to_starts_on_it(engine):
+    """Pressed with 4 N it stands 4 mm inside the undeformed floor: that is where it rests."""
+    scene = make_scene(BOX, compliance=1e-3)
+    pressed = simulate_step(
+        scene, vector(0, 0.05, 0), vector(0, 0.006, 0), STIFFNESS, engine=engine
+    )
+    assert float(pressed.pose[1]) < 0.05 - 3 * START_DEPTH
+    again = simulate_step(
+        scene,
+        pressed.pose,
+        vector(0, 0.0, 0),
+        STIFFNESS,
+        engine=engine,
+        previous=vector(0, 0.006, 0),
+    )
+    assert int(again.status) == StepStatus.CONVERGED
+
+
+def test_an_answer_that_something_else_has_moved_is_not_at_rest():
+    """The check looks at the answer alone: moved into the floor, off it, or along it, it fails."""
+    scene = make_scene(BOX).gather(torch.tensor([0]))
+    command, settings = vector([0.0, 0.01, 0.0]), StepSettings()
+    settled = settle_from(scene, vector([0.0, 0.05, 0.0]), command, STIFFNESS, settings)
+
+    def off(pose: Tensor) -> float:
+        arguments = (scene, pose, command, STIFFNESS, settled.contacts, settings)
+        return float(distance_from_rest(*arguments))
+
+    assert off(settled.pose) < 1e-7
+    for move in ((0, 1e-4, 0), (0, -1e-4, 0), (1e-4, 0, 0), (0, 0, 2e-3)):
+        assert 0.9e-4 < off(settled.pose + vector(*move)) < 2e-4
+    assert math.isinf(off(settled.pose + math.nan))

@@ -1,0 +1,50 @@
+"""How far an answer is from rest, and a start pose inside a terrain, in compiled loops; as in
+`rest`."""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+from tpcd.simulator.kernel_geometry import lowest_point, object_normal
+from tpcd.simulator.kernel_inner import inner
+
+
+@inner
+@no_type_check
+def depth_inside(world, o, chains, pose, load):
+    """How deep the object is inside a terrain that yields to its `load` (t) [m]; at least 0."""
+    cosine, sine, deepest = math.cos(pose[2]), math.sin(pose[2]), 0.0
+    for t in range(len(load)):
+        deepest = max(deepest, -_gap(world, o, chains, t, pose, cosine, sine, load[t]))
+    return deepest
+
+
+@inner(error_model="numpy")
+@no_type_check
+def distance_from_rest(world, o, chains, law, extent, pose, turn, space):
+    """How far a settled pose, turned by `turn` (cos, sin), is from rest [m].
+
+    `linear_system` must be filled for the pose. Infinite where it is no number.
+    """
+    system, worst, total = space.system, 0.0, 0.0
+    for a in range(3):
+        off = abs(system.unbalanced[a]) / law.stiffness[a]
+        off = off if a < 2 else off * extent
+        worst, total = max(worst, off), total + off
+    for t in range(world.normals.shape[1]):
+        gap = _gap(world, o, chains, t, pose, turn[0], turn[1], space.load[t])
+        # What is pushed by convex friction may be away from the terrain.
+        pushed = law.coulomb and space.load[t] > 0.0
+        worst, total = max(worst, abs(gap) if pushed else -gap), total + gap
+    return worst if math.isfinite(total) else math.inf
+
+
+@inner
+@no_type_check
+def _gap(world, o, chains, t, pose, cosine, sine, load):
+    """Gap to terrain t where it has yielded to a load [m]."""
+    u, v = object_normal(world, o, t, cosine, sine)
+    low, _ = lowest_point(world, o, chains, t, u, v)
+    gap = low + world.normals[o, t, 0] * pose[0] + world.normals[o, t, 1] * pose[1]
+    return gap - world.offsets[o, t] + world.compliance[o, t] * load

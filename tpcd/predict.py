@@ -9,6 +9,7 @@ follows from the pose, w = K (x' - u), so one mixture serves both.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +19,7 @@ from tpcd.belief.belief import Belief
 from tpcd.belief.misfit import misfit_rows
 from tpcd.belief.resampling import systematic_resample
 from tpcd.contact import ContactScene, column_scene, scene_from_parameters
+from tpcd.contract import as_numbers, check_finite, check_pose
 from tpcd.effects.conditions import Rows, sequence
 from tpcd.effects.simulate import RowByRow, SimulatedRows, simulate_rows
 from tpcd.planar import wrap_angle
@@ -68,17 +70,22 @@ class ContactPredictor:
         pose_std: Float[Tensor, " 3"] | None = None,
         sensor_std: Float[Tensor, " 6"] | None = None,
         keep_field: bool = False,
+        unusual: bool = False,
     ) -> Prediction:
         """Predict n transitions from pose and command [m, m, rad].
+
+        One row may be given without its axis, and one pose for many commands. Raises TypeError and
+        ValueError for other shapes, what is not finite and, unless `unusual`, what looks like
+        millimetres or degrees (see `tpcd.contract`). Where particles take the pose to be inside a
+        terrain, `Prediction.start_inside` says so.
 
         `previous` is the command at which the arm rested in `pose` (None: without load).
         `pose_std` is the noise of `pose` where it was measured (None: exact). With
         `sensor_std`, noise of the six channels, the prediction is of what sensors will read;
         without, of what will truly be. `keep_field` asks for `Prediction.component_field`.
         """
-        start_variance = pose.new_zeros(3) if pose_std is None else pose_std.double() ** 2
-        pose, command = pose.double(), command.double()
-        previous = None if previous is None else previous.double()
+        pose, command, previous = _asked(pose, command, previous, unusual)
+        start_variance = _variance("pose_std", pose_std, 3)
         found = None
         gap = self._gap(self._field_mean[:, None], command[:, 2])
         if self._added.effects:
@@ -92,6 +99,7 @@ class ContactPredictor:
                 self.belief.stiffness,
                 self.belief.step,
                 previous=previous,
+                unusual=True,
             )
         settled = transition.pose
         # Angles are averaged near the command, the short way round.
@@ -121,7 +129,7 @@ class ContactPredictor:
             wrench = found.wrench + (found.matrix @ moved[..., None])[..., 0]
             wrench = torch.where(keep, wrench, 0.0)
         identity = torch.eye(3, dtype=torch.float64)
-        sensor = pose.new_zeros(6) if sensor_std is None else sensor_std.double() ** 2
+        sensor = _variance("sensor_std", sensor_std, 6)
         return Prediction(
             command=command,
             stiffness=self.belief.stiffness,
@@ -129,8 +137,9 @@ class ContactPredictor:
             component_mean=torch.where(keep, settled, 0.0),
             component_covariance=torch.where(keep[..., None], covariance, identity),
             component_mode=transition.mode,
+            component_status=transition.status,
             answered=answered,
-            sensor_variance=sensor.double(),
+            sensor_variance=sensor,
             component_wrench=wrench,
             wrench_matrix=None if found is None else found.matrix,
             component_field=torch.where(keep[..., None], field, 0.0) if keep_field else None,
@@ -175,21 +184,27 @@ class ContactPredictor:
         generator: torch.Generator,
         samples: int = 200,
         previous: Float[Tensor, " 3"] | None = None,
+        unusual: bool = False,
     ) -> Float[Tensor, "samples n 6"]:
         """Draw whole trajectories: every particle follows its own poses, n steps long.
 
         Each trajectory keeps one theta, its effects and one draw of its misfit field throughout.
         What the field leaves to each reading is drawn at each step. A trajectory that a step has no
-        answer for is replaced by another one; where all are, everything is NaN.
+        answer for is replaced by another one; where all are, everything is NaN. What is taken and
+        raised is that of `predict`.
         """
+        if samples < 1:
+            raise ValueError(f"samples is {samples}, expected at least 1")
+        starts, commands, befores = _asked(pose, commands, previous, unusual)
+        if bool((starts != starts[:1]).any()):
+            raise ValueError(f"pose has shape {tuple(pose.shape)}, expected the pose of one start")
+        pose, before = starts[0], None if befores is None else befores[0]
         chosen = torch.multinomial(self.weights, samples, replacement=True, generator=generator)
         scene = self._scene.gather(chosen)
         field = self._field_mean[chosen]
         if field.shape[-1]:
             noise = torch.randn(field.shape, generator=generator, dtype=torch.float64)
             field = field + (self._field_root[chosen] @ noise[..., None])[..., 0]
-        pose, commands = pose.double(), commands.double()
-        before = None if previous is None else previous.double()
         gaps = self._gap(field[:, None], commands[:, 2])
         rough, levers = gaps, None
         if gaps is not None:
@@ -217,7 +232,7 @@ class ContactPredictor:
             if walk is None:
                 world = scene if rough is None else scene.further(rough[:, row - 1])
                 transition = simulate_step(
-                    world, here, command, stiffness, self.belief.step, previous=before
+                    world, here, command, stiffness, self.belief.step, previous=before, unusual=True
                 )
             else:
                 found = walk.settle(row, here)
@@ -258,6 +273,37 @@ class ContactPredictor:
         )
         gap, lever = self._field_sd[chosen, None, None] * noise
         return left[:, None] * gap, field.roughness * lever
+
+
+def _asked(
+    pose: Any, command: Any, previous: Any, unusual: bool
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"] | None]:
+    """What is asked of a predictor, as rows of equal number."""
+    cpu, found = torch.device("cpu"), []
+    for name, given in (("pose", pose), ("command", command), ("previous", previous)):
+        if given is None and name == "previous":
+            continue
+        rows = as_numbers(name, given, 3, axes=2, device=cpu).double()
+        check_finite(name, rows)
+        check_pose(name, rows, unusual)
+        found.append((name, rows))
+    count = max(len(rows) for _, rows in found)
+    for name, rows in found:
+        if len(rows) not in (1, count):
+            raise ValueError(f"{name} has {len(rows)} rows, expected 1 or {count} as the others")
+    rows = [rows.expand(count, 3) for _, rows in found]
+    return rows[0], rows[1], rows[2] if len(rows) > 2 else None
+
+
+def _variance(name: str, std: Any, count: int) -> Float[Tensor, " c"]:
+    """The variances of so many channels with the given standard deviation; zeros for None."""
+    if std is None:
+        return torch.zeros(count, dtype=torch.float64)
+    found = as_numbers(name, std, count, axes=1, device=torch.device("cpu")).double()
+    check_finite(name, found)
+    if bool((found < 0).any()):
+        raise ValueError(f"{name} is {found.tolist()}, expected no negative number")
+    return found**2
 
 
 def _shift(

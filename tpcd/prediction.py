@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.planar import wrap_angle
+from tpcd.simulator.record import StepStatus
 
 CHANNELS = ("x", "z", "phi", "F_x", "F_z", "tau")
 """The predicted channels in order; units m, m, rad, N, N, N·m."""
@@ -44,6 +45,20 @@ class Prediction:
     component_field: Float[Tensor, "m n 3 j"] | None = None
     """Factor L of the part L L^T of `component_covariance` that comes from what is not known yet of
     the outline's misfit, in j standard normal numbers of the particle; None where not asked for."""
+
+    component_status: Int[Tensor, "m n"] | None = None
+    """`StepStatus` of each particle's answer; None where it is not known."""
+
+    @property
+    def start_inside(self) -> Float[Tensor, " n"]:
+        """Probability that the start pose is inside a terrain, by more than a measurement errs.
+
+        Where it is near 1, the pose is of another frame, unit or scene than the belief.
+        """
+        if self.component_status is None:
+            return torch.full_like(self.weights[0], torch.nan)
+        inside = self.component_status == int(StepStatus.START_INSIDE)
+        return (self.weights * inside).sum(0)
 
     @property
     def component_variance(self) -> Float[Tensor, "m n 3"]:

@@ -113,6 +113,7 @@ def filter_history(
                 _row(conditions.stiffness, k + 1),
                 settings,
                 previous=_row(conditions.target, k) + begins,
+                unusual=True,
             )
             pose = transition.pose - ends + _row(conditions.give, k + 1)
             residual = angle_difference(merged.poses[:, k + 1], pose)

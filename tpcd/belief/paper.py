@@ -175,6 +175,7 @@ def window_log_likelihood(
         episode.stiffness,
         settings.step,
         previous=episode.commands[before],
+        unusual=True,
     )
     pose = episode.poses[rows] - transition.pose
     pose = torch.cat((pose[..., :2], wrap_angle(pose[..., 2:])), dim=-1)

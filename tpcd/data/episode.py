@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.contract import as_numbers, check_pose, check_stiffness
 from tpcd.data.checks import COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS
 
 COLUMNS = ("step", *COMMAND_COLUMNS, *POSE_COLUMNS, *WRENCH_COLUMNS)
@@ -25,7 +26,9 @@ class Episode:
 
     Poses and commands are (x, z, phi) [m, m, rad] of the end effector in the world;
     wrenches (F_x, F_z, tau) [N, N, N·m] are what the world exerts on the object about the
-    end-effector origin, in world axes. `ValueError` for tensors of another shape or dtype.
+    end-effector origin, in world axes. Arrays and lists are taken for tensors. `TypeError` and
+    `ValueError` for other shapes and, unless `unusual`, for what looks like millimetres, degrees or
+    N/mm (see `tpcd.contract`).
     """
 
     commands: Float[Tensor, "n 3"]
@@ -44,16 +47,23 @@ class Episode:
     """Further columns of the table, each of length n."""
     path: Path | None = None
     """The table the episode was read from."""
+    unusual: bool = False
+    """That lengths beyond 5 m, angles beyond a turn and springs no arm has are meant so."""
 
     def __post_init__(self) -> None:
-        n = self.commands.shape[0] if self.commands.ndim else 0
-        shapes = {"commands": (n, 3), "poses": (n, 3), "wrenches": (n, 3)}
-        for name, shape in {**shapes, "stiffness": (3,), "sensor_std": (6,)}.items():
-            value = getattr(self, name)
-            if tuple(value.shape) != shape or value.dtype != torch.float64:
-                raise ValueError(
-                    f"{name} is {tuple(value.shape)} {value.dtype}, expected {shape} torch.float64"
-                )
+        cpu = torch.device("cpu")
+        rows = ("commands", "poses", "wrenches")
+        for name in (*rows, "stiffness", "sensor_std"):
+            last, axes = (6 if name == "sensor_std" else 3), (2 if name in rows else 1)
+            value = as_numbers(name, getattr(self, name), last, device=cpu).double()
+            n = len(self.commands) if name in rows else last
+            if value.ndim != axes or len(value) != n:
+                shape = (n, last) if axes == 2 else (last,)
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")
+            object.__setattr__(self, name, value)
+        check_stiffness(self.stiffness, self.unusual)
+        for name in ("commands", "poses"):
+            check_pose(name, getattr(self, name), self.unusual)
         for name, column in self.extra.items():
             if name in COLUMNS or np.shape(column) != (n,):
                 raise ValueError(f"extra column {name!r} must be new and of length {n}")

@@ -73,6 +73,7 @@ def read_rows(table_path: Path, header: Header) -> Episode:
         priors=header.priors,
         extra={name: column for name, column in table.items() if name not in COLUMNS},
         path=table_path,
+        unusual=header.unusual,
     )
 
 
@@ -112,6 +113,7 @@ def episode_contents(
         notes=episode.notes,
         time_step_s=episode.time_step_s,
         priors=dict(episode.priors),
+        unusual=episode.unusual,
     )
     header_bytes = encode_header(header)
     parse_header(yaml.safe_load(header_bytes), header_path)

@@ -15,20 +15,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
+from tpcd.contract import LARGEST_LENGTH, check_stiffness
 from tpcd.errors import EpisodeError
 from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
 
-KEYS = ("stiffness", "sensor_std", "object", "notes", "time_step_s", "priors", "commands")
+KEYS = (
+    *("stiffness", "sensor_std", "object", "notes", "time_step_s", "priors", "commands"),
+    "unusual",
+)
 SENSOR_NAMES = ("x", "z", "phi", "F_x", "F_z", "tau")
 ESTIMATE_NOISE = (
     "hold the arm still without contact, record for about 10 s and give the standard deviation"
     " of x, z [m], phi [rad], F_x, F_z [N], tau [N·m], e.g."
     " sensor_std: [0.0002, 0.0002, 0.0005, 0.3, 0.3, 0.02]"
 )
-LARGEST_LENGTH = 5.0
-"""Lengths beyond this [m] are taken for millimetres."""
 LARGEST_NOISE = {"x": (0.05, "m", "mm"), "z": (0.05, "m", "mm"), "phi": (0.5, "rad", "degrees")}
 """Noise of poses beyond this [m, rad] is taken for millimetres or degrees."""
 
@@ -46,6 +49,8 @@ class Header:
     priors: dict[str, tuple[float, float]]
     commands_known: bool = True
     """False where the set points were not recorded."""
+    unusual: bool = False
+    """Whether a stiffness that looks like another unit is meant so."""
 
 
 def read_header(path: Path) -> Header:
@@ -99,6 +104,14 @@ def parse_header(content: Any, path: Path) -> Header:
             raise EpisodeError(
                 path, f"stiffness of {axis} is {value:g}, expected > 0", "give the controller's K"
             )
+    unusual = content.get("unusual", False)
+    if not isinstance(unusual, bool):
+        raise EpisodeError(path, f"unusual is {unusual!r}, expected true or false", "leave it out")
+    try:
+        check_stiffness(torch.tensor(stiffness, dtype=torch.float64), unusual)
+    except ValueError as error:
+        fault, _, remedy = str(error).partition("; ")
+        raise EpisodeError(path, fault, remedy.replace("=True", ": true")) from error
     sensor_std = _sensor_std(path, content["sensor_std"]) if "sensor_std" in content else None
     time_step = content.get("time_step_s")
     if time_step is not None:
@@ -118,6 +131,7 @@ def parse_header(content: Any, path: Path) -> Header:
         time_step_s=time_step,
         priors=_priors(path, content.get("priors")),
         commands_known=commands == "known",
+        unusual=unusual,
     )
 
 
@@ -128,6 +142,8 @@ def encode_header(header: Header) -> bytes:
         content["sensor_std"] = list(header.sensor_std)
     if not header.commands_known:
         content["commands"] = "unknown"
+    if header.unusual:
+        content["unusual"] = True
     for key in ("object", "notes", "time_step_s"):
         if getattr(header, key) is not None:
             content[key] = getattr(header, key)

@@ -188,7 +188,9 @@ def _settle(
         first, way = previous, angle_difference(commands, previous)
         previous, commands = (first + share * way for share in span)
     stiffness = _at(conditions.stiffness, index)
-    transition = simulate_step(here, starts, commands, stiffness, settings, previous=previous)
+    transition = simulate_step(
+        here, starts, commands, stiffness, settings, previous=previous, unusual=True
+    )
     return replace(transition, pose=transition.pose + _moved(conditions, index))
 
 

@@ -59,6 +59,10 @@ class Status(IntEnum):
     )
 
 
+REQUIRED = ("hessian", "target", "rows", "offsets")
+"""Parts that a problem must have."""
+
+
 @dataclass(frozen=True)
 class ContactQP:
     """A batch of contact problems; see the file's opening for the equations.
@@ -136,6 +140,14 @@ def check_problem(problem: ContactQP) -> None:
     What depends on the numbers (NaN, an indefinite hessian) is no error but a status of
     the element. Raises TypeError for dtypes, ValueError for shapes and devices.
     """
+    for name, value in vars(problem).items():
+        if not isinstance(value, Tensor) and (value is not None or name in REQUIRED):
+            raise TypeError(f"{name} is a {type(value).__name__}, expected a tensor")
+    if problem.target.ndim < 1 or problem.rows.ndim < 2 or problem.hessian.ndim < 2:
+        raise ValueError(
+            f"target has shape {tuple(problem.target.shape)}, rows {tuple(problem.rows.shape)} and"
+            f" hessian {tuple(problem.hessian.shape)}, expected (n), (m, n) and (n, n) at least"
+        )
     target, batch = problem.target, problem.batch_shape
     n, m = problem.variables, problem.row_count
     if target.dtype not in (torch.float32, torch.float64):

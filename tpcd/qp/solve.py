@@ -43,6 +43,8 @@ def solve(
     Raises ValueError or TypeError where shapes, dtypes or devices do not fit, and
     SolverError where the engine is not installed.
     """
+    if not isinstance(problem, ContactQP):
+        raise TypeError(f"problem is a {type(problem).__name__}, expected a ContactQP")
     check_problem(problem)
     if engine not in ENGINES:
         raise ValueError(f"engine is {engine!r}, expected one of {', '.join(ENGINES)}")

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.contact import ContactScene
+from tpcd.contract import as_numbers, check_pose, check_stiffness
 from tpcd.simulator import native
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.path import follow_path
@@ -39,6 +40,7 @@ def simulate_step(
     settings: StepSettings = DEFAULT_SETTINGS,
     engine: Engine = "auto",
     previous: Float[Tensor, "*#batch 3"] | None = None,
+    unusual: bool = False,
 ) -> Transition:
     """Settle at `command` [m, m, rad] from the start pose `pose`.
 
@@ -49,17 +51,22 @@ def simulate_step(
 
     The batch axes of `scene`, `pose`, the commands and the stiffness are broadcast against each
     other. `stiffness` is the diagonal of K [N/m, N/m, N·m/rad]. Contact is solved in float64.
-    Raises ValueError for a stiffness that is not positive and finite, and for a pose or command
-    that has not three numbers.
+    Arrays and lists are taken for tensors. Raises TypeError and ValueError for what has not three
+    numbers, a stiffness that is not positive and finite and, unless `unusual`, for what looks like
+    millimetres, degrees or N/mm (see `tpcd.contract`). Numbers that make no scene are a status.
     """
-    right = (stiffness > 0) & torch.isfinite(stiffness)
-    if stiffness.shape[-1:] != (3,) or not bool(right.all()):
-        raise ValueError(
-            f"stiffness is {stiffness.tolist()}, expected three positive finite numbers"
-        )
-    for name, one in (("pose", pose), ("command", command), ("previous", previous)):
-        if one is not None and one.shape[-1:] != (3,):
-            raise ValueError(f"{name} has shape {tuple(one.shape)}, expected three numbers each")
+    if not isinstance(scene, ContactScene):
+        raise TypeError(f"scene is a {type(scene).__name__}, expected a ContactScene")
+    device = scene.friction.device
+    pose = as_numbers("pose", pose, 3, device=device)
+    command = as_numbers("command", command, 3, device=device)
+    stiffness = as_numbers("stiffness", stiffness, 3, device=device)
+    check_stiffness(stiffness, unusual)
+    check_pose("pose", pose, unusual)
+    check_pose("command", command, unusual)
+    if previous is not None:
+        previous = as_numbers("previous", previous, 3, device=device)
+        check_pose("previous", previous, unusual)
     given = (pose, command, stiffness) if previous is None else (pose, command, stiffness, previous)
     batch = torch.broadcast_shapes(scene.batch_shape, *(one.shape[:-1] for one in given))
     if stiffness.ndim > 1:
@@ -115,12 +122,19 @@ def rollout(
     settings: StepSettings = DEFAULT_SETTINGS,
     engine: Engine = "auto",
     previous: Float[Tensor, "*#batch 3"] | None = None,
+    unusual: bool = False,
 ) -> list[Transition]:
-    """Run n commands in a row, each from the pose at which the one before came to rest."""
+    """Run n commands in a row, each from the pose at which the one before came to rest.
+
+    What is taken and raised is that of `simulate_step`.
+    """
     transitions = []
+    commands = as_numbers("commands", commands, 3)
+    if commands.ndim < 2:
+        raise ValueError(f"commands has shape {tuple(commands.shape)}, expected rows of 3 numbers")
     for command in commands:
         transition = simulate_step(
-            scene, pose, command, stiffness, settings, engine, previous=previous
+            scene, pose, command, stiffness, settings, engine, previous, unusual
         )
         transitions.append(transition)
         pose, previous = transition.pose, command

@@ -1,0 +1,106 @@
+"""The contract of the doors in Python: which numbers are taken, in which units, and what is said of
+others.
+
+Tensors, arrays and lists of numbers are taken; whole numbers become float64. What has another shape
+or device, or no numbers, is refused before anything is computed. So is what looks like another unit
+(millimetres, degrees, N/mm), unless the caller insists with `unusual=True`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+LARGEST_LENGTH = 5.0
+"""Lengths beyond this [m] are taken for millimetres: no arm reaches so far."""
+LARGEST_ANGLE = 2 * math.pi
+"""Angles beyond this [rad] are taken for degrees."""
+LEAST_STIFFNESS, LARGEST_STIFFNESS = 10.0, 1e6
+"""Springs of an arm [N/m]. Softer ones are taken for N/mm, in which arms have 0.03 to 5; no arm is
+stiffer."""
+LARGEST_TURNING_STIFFNESS = 1e4
+"""The same about its axis [N·m/rad]; stiffer ones are taken for N·mm/rad."""
+INSIST = "or say unusual=True if that is meant"
+
+
+def as_numbers(
+    name: str, value: Any, last: int, axes: int | None = None, device: torch.device | None = None
+) -> Float[Tensor, "*batch n"]:
+    """A floating tensor of `value`, with `last` numbers on its last axis.
+
+    `axes` is the most axes it may have; one that is missing comes first, with length 1. Raises
+    TypeError for what is no real numbers, ValueError for another shape or device.
+    """
+    expected = f"expected {'rows of ' if axes == 2 else ''}{last} numbers"
+    if isinstance(value, Tensor):
+        found = value
+    else:
+        try:
+            found = torch.from_numpy(np.array(value, dtype=None))
+        except (TypeError, ValueError) as error:
+            told = type(value).__name__ if value is None or isinstance(value, str) else repr(value)
+            raise TypeError(f"{name} is {told[:60]}, {expected}") from error
+    if found.dtype == torch.bool or found.is_complex():
+        raise TypeError(f"{name} holds {str(found.dtype).removeprefix('torch.')}, {expected}")
+    if found.ndim == 0 or found.shape[-1] != last or (axes and found.ndim > axes):
+        raise ValueError(f"{name} has shape {tuple(found.shape)}, {expected}")
+    if device is not None and found.device != device:
+        raise ValueError(f"{name} is on {found.device}, expected it on {device} as the rest is")
+    if axes and found.ndim < axes:
+        found = found.reshape(*[1] * (axes - found.ndim), *found.shape)
+    return found if found.is_floating_point() else found.double()
+
+
+def check_finite(name: str, value: Float[Tensor, "*batch n"]) -> None:
+    """Refuse a NaN or an infinity; names the row. Raises ValueError."""
+    bad = ~torch.isfinite(value)
+    if bool(bad.any()):
+        place = torch.nonzero(bad)[0].tolist()
+        where = f" at {place}" if value.ndim > 1 else ""
+        raise ValueError(f"{name} is {float(value[tuple(place)])}{where}, expected a finite number")
+
+
+def check_pose(name: str, value: Float[Tensor, "*batch 3"], unusual: bool = False) -> None:
+    """Refuse poses or commands (x, z, angle) that are no metres and radians; ValueError."""
+    if unusual or value.numel() == 0:
+        return
+    with torch.no_grad():
+        largest = value.abs().reshape(-1, 3).nan_to_num(0.0, 0.0, 0.0).amax(0).tolist()
+    for reached, limit, unit, likely in (
+        (max(largest[:2]), LARGEST_LENGTH, "m", "millimetres"),
+        (largest[2], LARGEST_ANGLE, "rad", "degrees"),
+    ):
+        if reached > limit:
+            raise ValueError(
+                f"{name} reaches {reached:g}, expected {unit} (at most {limit:.3g}): it looks like"
+                f" {likely}; convert it, {INSIST}"
+            )
+
+
+def check_stiffness(value: Float[Tensor, "*batch 3"], unusual: bool = False) -> None:
+    """Refuse stiffness along x, z [N/m] and about y [N·m/rad] that is not positive and finite, or
+    that looks like N/mm or N·mm/rad; ValueError."""
+    right = (value > 0) & torch.isfinite(value)
+    if not bool(right.all()):
+        raise ValueError(f"stiffness is {value.tolist()}, expected three positive finite numbers")
+    if unusual or value.numel() == 0:
+        return
+    with torch.no_grad():
+        each = value.reshape(-1, 3)
+        least, largest = float(each[:, :2].min()), float(each[:, :2].max())
+        turning = float(each[:, 2].max())
+    if least < LEAST_STIFFNESS:
+        fault = f"{least:g}, expected N/m ({LEAST_STIFFNESS:g} or more): it looks like N/mm"
+    elif largest > LARGEST_STIFFNESS:
+        fault = f"{largest:g}, expected N/m (at most {LARGEST_STIFFNESS:g})"
+    elif turning > LARGEST_TURNING_STIFFNESS:
+        limit = LARGEST_TURNING_STIFFNESS
+        fault = f"{turning:g}, expected N·m/rad (at most {limit:g}): it looks like N·mm/rad"
+    else:
+        return
+    raise ValueError(f"stiffness is {fault}; convert it, {INSIST}")

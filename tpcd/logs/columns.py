@@ -126,7 +126,9 @@ def log_from_columns(
         kind = "command" if name.startswith("u_") else "wrench" if name[0] in "FT" else "pose"
         groups["wrench" if name == "tau" else kind].append(name)
     full = {
-        kind: timed[np.isfinite(np.stack([values[n][timed] for n in names])).all(0)]
+        kind: timed[
+            functools.reduce(np.logical_and, (np.isfinite(values[n]) for n in names))[timed]
+        ]
         for kind, names in groups.items()
         if names
     }
@@ -148,6 +150,7 @@ def log_from_columns(
         rows = rows if apart else timed
         block = np.stack([values[name][rows] for name in groups[kind]], axis=1)
         streams.append(Stream(path.name, tuple(groups[kind]), times[rows], block))
+    values.clear()
     extra = {name: columns[name][full["pose"] if apart else timed] for name in keep}
     return join(path, streams, euler, delays, (), notes, missing, extra)
 
@@ -177,7 +180,9 @@ def read_numbers(
             # Whole nanoseconds are subtracted as such: a float holds them to 256 ns only.
             content = content - _first(content)
             content = content.astype(np.int64) if content.dtype.kind == "u" else content
-        values[name] = UNITS[name][unit or next(iter(UNITS[name]))] * content.astype(np.float64)
+        factor = UNITS[name][unit or next(iter(UNITS[name]))]
+        content = content.astype(np.float64, copy=False)
+        values[name] = content if factor == 1.0 else factor * content
     return values, notes
 
 

@@ -7,6 +7,7 @@ recorded: what comes late or repeats a time is left out, nothing is sorted.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -75,20 +76,20 @@ def join(
         notes.append(f"{again} samples repeat the time before and are left out")
     if int((~fresh).sum()) > again:
         notes.append(f"{int((~fresh).sum()) - again} samples come late and are left out")
-    at = pose.times[fresh]
-    values = {name: pose.values[fresh, k] for k, name in enumerate(pose.channels)}
-    held = [column for column in _interpolated(wrench, at, findings).T]
-    values.update(zip(wrench.channels, held, strict=True))
+    at, own = _forward(pose)
+    values = dict(zip(pose.channels, own.T, strict=True))
+    values.update(zip(wrench.channels, _interpolated(wrench, at, findings).T, strict=True))
     if command is not None:
         values.update(zip(command.channels, _held(command, at).T, strict=True))
-    good = np.isfinite(np.stack(list(values.values()))).all(0)
+    good = functools.reduce(np.logical_and, (np.isfinite(column) for column in values.values()))
     if good.sum() < 2:
         raise LogError(
             path,
             f"{int(good.sum())} of {len(at)} samples of the pose have all numbers",
             "check the map or the topics, and what is missing",
         )
-    values = {name: column[good] for name, column in values.items()}
+    if not good.all():
+        values = {name: column[good] for name, column in values.items()}
     zero = float(at[good][0])
     moved = tuple(replace(part, times=part.times - zero) for part in parts.values())
     given = [_earlier(each, zero) for each in (*findings, *told)]
@@ -131,7 +132,8 @@ def join(
 
 def _turning(stream: Stream) -> tuple[Stream, str]:
     """The stream without its quaternions of length 0, which are no rotation, and what is told."""
-    stream = replace(stream, values=np.where(np.isfinite(stream.values), stream.values, np.nan))
+    if np.isinf(stream.values).any():
+        stream = replace(stream, values=np.where(np.isinf(stream.values), np.nan, stream.values))
     names = [name.removeprefix("u_") for name in stream.channels]
     places = [names.index(name) for name in ROTATIONS["quaternion"] if name in names]
     if len(places) < 4:
@@ -189,8 +191,9 @@ def _interpolated(
     stream: Stream, times: Float[np.ndarray, " n"], findings: Sequence[Finding]
 ) -> Float[np.ndarray, "n w"]:
     """Values at some times; NaN where the samples around hold none, or are a gap apart."""
-    fresh = forward(stream.times)
-    own, values = stream.times[fresh], stream.values[fresh]
+    own, values = _forward(stream)
+    if np.array_equal(own, times):
+        return values  # as in a table, whose rows have one time
     after = np.clip(np.searchsorted(own, times), 0, len(own) - 1)
     # A sample at the very time stands alone.
     before = np.where(own[after] == times, after, np.maximum(after - 1, 0))
@@ -207,9 +210,19 @@ def _interpolated(
 
 def _held(stream: Stream, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n w"]:
     """The last values at some times; NaN before the first."""
+    own, values = _forward(stream)
+    if np.array_equal(own, times):
+        return values
+    last = np.searchsorted(own, times, side="right") - 1
+    return np.where(last[:, None] < 0, np.nan, values[np.maximum(last, 0)])
+
+
+def _forward(stream: Stream) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k w"]]:
+    """Times and values without what comes late."""
     fresh = forward(stream.times)
-    last = np.searchsorted(stream.times[fresh], times, side="right") - 1
-    return np.where(last[:, None] < 0, np.nan, stream.values[fresh][np.maximum(last, 0)])
+    if fresh.all():
+        return stream.times, stream.values
+    return stream.times[fresh], stream.values[fresh]
 
 
 def _earlier(finding: Finding, by: float) -> Finding:

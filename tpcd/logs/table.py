@@ -69,7 +69,11 @@ def read_columns(path: Path) -> Table:
     except (UnicodeError, OSError, ValueError) as error:  # pyarrow's errors are of these
         problem = " ".join(str(error).split())
         raise LogError(path, f"cannot be read as a table ({problem})", "export it again") from error
-    for name, part in zip(content.column_names, content.columns, strict=True):
+    names, parts = content.column_names, content.columns
+    del content
+    for k, name in enumerate(names):
+        # One column after another, so that no more than one is there twice.
+        part, parts[k] = parts[k], None
         for column, values, unit in _flat(name, part, columns.layout):
             if column in columns:
                 raise LogError(path, f"column {column!r} appears twice", "rename one of them")
@@ -127,18 +131,25 @@ def _parquet(path: Path) -> Any:
 def _csv(path: Path, columns: Table) -> Any:
     from pyarrow import ArrowInvalid, csv, py_buffer, string
 
-    raw, columns.encoding = _utf8(path.read_bytes())
-    if not raw.strip():
+    columns.encoding = encoding = _encoding(path)
+    head, tail = _ends(path, encoding)
+    if not head.strip():
         raise ValueError("the file is empty")
-    if b"\n" not in raw[:HEAD] and b"\r" in raw[:HEAD]:
-        raw = raw.replace(b"\r", b"\n")
-    cut = raw.find(b"\n", max(len(raw) - TAIL, HEAD))
-    layout = find_layout(_lines(raw[:HEAD]), _lines(raw[cut:]) if cut > 0 else ())
+    # A cut line at the end of the sample, or at the beginning of the tail, shows no layout.
+    whole = not tail
+    layout = find_layout(_lines(head)[: None if whole else -1], _lines(tail)[1:])
     names = [name or f"column {k + 1}" for k, name in enumerate(layout.names)]
     columns.layout = layout
     columns.units = {n: u for n, u in zip(names, layout.units, strict=False) if u and u != "1"}
-    if layout.separator == " " and re.search(rb"[ \t]{2}|\n[ \t]|[ \t]\r?\n|\t", raw):
-        raw = re.sub(rb"(?m)^ | (?=\r?$)", b"", re.sub(rb"[ \t]+", b" ", raw))
+    # As it is where it can be read in parts; else in memory, as UTF-8 with a line feed a line.
+    source: Any = str(path)
+    old = "\n" not in head
+    if encoding not in ("utf-8", "utf-8-sig") or layout.separator == " " or old:
+        text = _text_of(path, encoding)
+        if layout.separator == " ":
+            text = re.sub(r"(?m)^ | $", "", re.sub(r"[ \t]+", " ", text))
+        source = py_buffer(text.encode())
+        del text
     odd: list[str] = []
 
     def ragged(row: Any) -> str:
@@ -148,7 +159,7 @@ def _csv(path: Path, columns: Table) -> Any:
     def read(kinds: dict[str, Any]) -> Any:
         odd.clear()
         return csv.read_csv(
-            py_buffer(raw),
+            source,
             csv.ReadOptions(column_names=names, skip_rows=layout.first),
             csv.ParseOptions(delimiter=layout.separator, invalid_row_handler=ragged),
             csv.ConvertOptions(
@@ -163,61 +174,86 @@ def _csv(path: Path, columns: Table) -> Any:
     except ArrowInvalid:
         # The kind of a column is found on the first rows; text further down breaks it.
         table = read(dict.fromkeys(names, string()))
-    columns.notes = layout.notes + _passed_over(odd, raw, layout)
+    columns.notes = layout.notes + (_passed_over(odd, path, encoding, layout) if odd else ())
     empty = [n for n, c in zip(names, table.columns, strict=True)
              if n.startswith("column ") and c.null_count == len(c)]  # fmt: skip
     # A separator at the end of each line makes a column without a name that holds nothing.
     return table.drop_columns([n for n in empty if not layout.names[names.index(n)]])
 
 
-def _utf8(raw: bytes) -> tuple[bytes, str]:
-    """The text in UTF-8, and in which encoding it was."""
-    for mark, encoding in (
-        (codecs.BOM_UTF8, "utf-8-sig"),
-        (codecs.BOM_UTF32_LE, "utf-32"),
-        (codecs.BOM_UTF16_LE, "utf-16"),
-        (codecs.BOM_UTF16_BE, "utf-16"),
-    ):
-        if raw.startswith(mark):
-            if encoding == "utf-8-sig":
-                return raw[len(mark) :], encoding
-            return raw.decode(encoding).encode(), encoding
-    head = raw[:1000]
-    for encoding, zeros in (("utf-16-le", head[1::2]), ("utf-16-be", head[::2])):
-        if zeros and 2 * zeros.count(0) > len(zeros):
-            return raw.decode(encoding).encode(), encoding
-    if raw.isascii():
-        return raw, "utf-8"
-    try:
-        raw.decode()
-    except UnicodeDecodeError:
-        return raw.decode("cp1252", errors="replace").encode(), "cp1252"
-    return raw, "utf-8"
+def _encoding(path: Path) -> str:
+    """The encoding of a text file: by its mark, by zeros, or by whether all of it is UTF-8."""
+    with path.open("rb") as file:
+        head = file.read(1000)
+        for mark, encoding in (
+            (codecs.BOM_UTF8, "utf-8-sig"),
+            (codecs.BOM_UTF32_LE, "utf-32"),
+            (codecs.BOM_UTF16_LE, "utf-16"),
+            (codecs.BOM_UTF16_BE, "utf-16"),
+        ):
+            if head.startswith(mark):
+                return encoding
+        for encoding, zeros in (("utf-16-le", head[1::2]), ("utf-16-be", head[::2])):
+            if zeros and 2 * zeros.count(0) > len(zeros):
+                return encoding
+        decoder = codecs.getincrementaldecoder("utf-8")()
+        try:
+            decoder.decode(head)
+            while part := file.read(1 << 20):
+                decoder.decode(part)
+            decoder.decode(b"", final=True)
+        except UnicodeDecodeError:
+            return "cp1252"
+    return "utf-8"
 
 
-def _lines(raw: bytes) -> list[str]:
-    return re.split("\r\n|\n|\r", raw.decode(errors="replace"))[: -1 if len(raw) >= HEAD else None]
+def _ends(path: Path, encoding: str) -> tuple[str, str]:
+    """The beginning of a text file, and the end of one that is longer."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+        size = file.seek(0, 2)
+        if size <= HEAD:
+            return head.decode(encoding, "replace" if encoding == "cp1252" else "strict"), ""
+        wide = 4 if "32" in encoding else 2
+        file.seek(max(HEAD, size - TAIL) // wide * wide)
+        tail = file.read()
+    bare = encoding if encoding[-2:] in ("le", "be") or "16" not in encoding else "utf-16-le"
+    if encoding == "utf-16" and head.startswith(codecs.BOM_UTF16_BE):
+        bare = "utf-16-be"
+    bare = "utf-32-le" if encoding == "utf-32" else bare
+    return head.decode(encoding, "replace"), tail.decode(bare, "replace")
+
+
+def _text_of(path: Path, encoding: str) -> str:
+    """All of a text file, with a line feed at the end of each line."""
+    errors = "replace" if encoding == "cp1252" else "strict"
+    with path.open(encoding=encoding, errors=errors) as file:
+        return file.read()
+
+
+def _lines(text: str) -> list[str]:
+    return re.split("\r\n|\n|\r", text)
 
 
 def _fits(line: str, layout: Layout) -> bool:
     return len(split(line, layout.separator)) == len(layout.names)
 
 
-def _passed_over(odd: list[str], raw: bytes, layout: Layout) -> tuple[str, ...]:
+def _passed_over(odd: list[str], path: Path, encoding: str, layout: Layout) -> tuple[str, ...]:
     """Notes on lines of another width that can be passed over: remarks, and a last line cut off.
 
     Raises `ValueError` for any other.
     """
-    notes, remarks = [], 0
-    for text in odd:
-        if text.lstrip()[:1] in ("#", "%"):
-            remarks += 1
+    notes, remarks = [], sum(text.lstrip()[:1] in ("#", "%") for text in odd)
+    text = _text_of(path, encoding)
+    for number, line in enumerate(text.split("\n"), start=1):
+        if number <= layout.first or not line.strip() or _fits(line, layout):
             continue
-        at = raw.rfind(text.encode()) if text.strip() else -1
-        line = raw.count(b"\n", 0, at) + 1
-        found = len(split(text, layout.separator))
-        problem = f"line {line} has {found} cells, expected {len(layout.names)}"
-        if raw[at + len(text.encode()) :]:
+        if line.lstrip()[:1] in ("#", "%"):
+            continue
+        found = len(split(line, layout.separator))
+        problem = f"line {number} has {found} cells, expected {len(layout.names)}"
+        if not text.endswith(line):
             raise ValueError(problem)
         notes.append(f"{problem}: it is the last, cut off in writing, and left out")
     if remarks:

@@ -41,7 +41,23 @@ WIDE = 0.12
 """An interval that reaches further than this to either side tells nothing [s]."""
 CLEAR = 0.05
 """Where the best delays leave not even this part less than others do, there is nothing to tell."""
-Samples = tuple[Float[np.ndarray, " _"], Float[np.ndarray, "_ _"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Averages:
+    """The averages of a stream over `SPAN` to either side of any time, from its integral."""
+
+    times: Float[np.ndarray, " k"]
+    """Of its samples [s]."""
+    integral: Float[np.ndarray, "k w"]
+
+    def at(self, times: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s w"]:
+        """Averages around some times, which must lie within those of the samples."""
+        late, early = (
+            np.stack([np.interp(times + by, self.times, part) for part in self.integral.T], axis=1)
+            for by in (SPAN, -SPAN)
+        )
+        return (late - early) / (2 * SPAN)
 
 
 @dataclass(frozen=True)
@@ -91,18 +107,15 @@ def check_delays(streams: Sequence[Stream]) -> list[Finding]:
 
 def estimate_delays(streams: Sequence[Stream]) -> tuple[Delay, ...]:
     """Delays of wrench and set point against the pose; none where one of the three is missing."""
-    there = {role(stream): _numbers(stream) for stream in streams}
-    if set(there) != {"pose", "wrench", "command"}:
+    there = {role(stream): _averages(stream) for stream in streams}
+    pose, wrench, command = (there.get(name) for name in ("pose", "wrench", "command"))
+    if pose is None or wrench is None or command is None:
         return ()
-    if any(len(times) < 2 for times, _ in there.values()):
-        return ()
-    pose, wrench, command = there["pose"], there["wrench"], there["command"]
-    times = _moments(pose, wrench)
-    span = max(SPAN, 1.5 * float(np.median(np.diff(pose[0]))))
-    at, late, early = (_between(pose, times + by) for by in (0.0, span, -span))
+    times = _moments(pose.times, wrench.times)
+    span = max(SPAN, 1.5 * float(np.median(np.diff(pose.times))))
+    at, late, early = (pose.at(times + by) for by in (0.0, span, -span))
     motion = [at, (late - early) / (2 * span), (late - 2 * at + early) / span**2]
-    values = _between(wrench, times)
-    if len(times) < 10 * BLOCKS or not values.std(0).any():
+    if len(times) < 10 * BLOCKS or not wrench.at(times).std(0).any():
         return ()
     lags = {of: np.arange(-REACH, REACH + step / 2, step) for of, step in STEPS.items()}
     left = _left_over(times, motion, command, wrench, lags)
@@ -119,24 +132,24 @@ def estimate_delays(streams: Sequence[Stream]) -> tuple[Delay, ...]:
 def _left_over(
     times: Float[np.ndarray, " s"],
     motion: list[Float[np.ndarray, "s _"]],
-    command: Samples,
-    wrench: Samples,
+    command: Averages,
+    wrench: Averages,
     lags: dict[str, Float[np.ndarray, " _"]],
 ) -> Float[np.ndarray, "b c l"]:
     """Part of the wrench's variance that is left at each pair of delays of set point and wrench:
     of the whole recording, then without each of its blocks."""
-    still = _between(wrench, times)
+    still = wrench.at(times)
     moving = still.std(0) > 0
     mean, size = still.mean(0)[moving], still.std(0)[moving]
     shifted = np.stack(
-        [(_between(wrench, times + lag)[:, moving] - mean) / size for lag in lags["wrench"]], axis=1
+        [(wrench.at(times + lag)[:, moving] - mean) / size for lag in lags["wrench"]], axis=1
     )
     flat = shifted.reshape(len(times), -1)
     blocks = np.array_split(np.arange(len(times)), BLOCKS)
     square = np.stack([(shifted[block] ** 2).sum((0, 2)) for block in blocks])
     left = np.empty((BLOCKS + 1, len(lags["command"]), len(lags["wrench"])))
     for k, lag in enumerate(lags["command"]):
-        design = _design([*motion, _held(command, times + lag)])
+        design = _design([*motion, command.at(times + lag)])
         gram = np.stack([design[block].T @ design[block] for block in blocks])
         cross = np.stack([design[block].T @ flat[block] for block in blocks])
         for out in range(-1, BLOCKS):
@@ -164,62 +177,43 @@ def _lowest(
     return found[0], found[1]
 
 
-def _moments(pose: Samples, wrench: Samples) -> Float[np.ndarray, " s"]:
+def _moments(
+    pose: Float[np.ndarray, " p"], wrench: Float[np.ndarray, " f"]
+) -> Float[np.ndarray, " s"]:
     """Where to compare: evenly over what both span, apart from gaps, with room for every delay."""
     room = REACH + 3 * SPAN
-    first, last = max(pose[0][0], wrench[0][0]) + room, min(pose[0][-1], wrench[0][-1]) - room
+    first, last = max(pose[0], wrench[0]) + room, min(pose[-1], wrench[-1]) - room
     times = np.linspace(first, last, int(np.clip((last - first) / 0.01, 0, SAMPLES)))
-    for start, end in np.concatenate((find_gaps(pose[0]), find_gaps(wrench[0]))).tolist():
+    for start, end in np.concatenate((find_gaps(pose), find_gaps(wrench))).tolist():
         times = times[(times < start - room) | (times > end + room)]
     return times
 
 
-def _numbers(stream: Stream) -> Samples:
-    """The samples that hold numbers, forward in time, with turns that run on."""
-    kept = read(stream)
+def _averages(stream: Stream) -> Averages | None:
+    """A stream for averages; None where it has not two samples that hold numbers."""
+    kept = np.flatnonzero(read(stream))
+    kept = kept[forward(stream.times[kept])]
+    if len(kept) < 2:
+        return None
+    # Four samples to either side of a moment are enough.
+    every = max(1, int(SPAN / 4 / float(np.median(np.diff(stream.times[kept])))))
+    kept = np.unique(np.append(kept[::every], kept[-1]))
     times, values = stream.times[kept], stream.values[kept]
-    fresh = forward(times)
-    times, values = times[fresh], values[fresh]
     names = [name.removeprefix("u_") for name in stream.channels]
     turning = [k for k, name in enumerate(names) if name in ("qx", "qy", "qz", "qw")]
-    if turning and len(values):
+    if turning:
         # A quaternion and its negative are one turn.
         sign = np.where((values[1:, turning] * values[:-1, turning]).sum(1) < 0, -1.0, 1.0)
         values[1:, turning] *= np.cumprod(sign)[:, None]
     for k, name in enumerate(names):
         if name in ("e1", "e2", "e3", "phi"):
             values[:, k] = np.unwrap(values[:, k])
-    return times, values
-
-
-def _between(samples: Samples, times: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s w"]:
-    """Averages of values on straight lines, over `SPAN` to either side."""
-    own, values = samples
-    steps = 0.5 * np.diff(own)[:, None] * (values[1:] + values[:-1])
-    return _mean(own, steps, values[-1], times)
-
-
-def _held(samples: Samples, times: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s w"]:
-    """Averages of values that hold until the next one comes, over `SPAN` to either side."""
-    own, values = samples
-    return _mean(own, np.diff(own)[:, None] * values[:-1], values[-1], times)
-
-
-def _mean(
-    own: Float[np.ndarray, " k"],
-    steps: Float[np.ndarray, "j w"],
-    last: Float[np.ndarray, " w"],
-    times: Float[np.ndarray, " s"],
-) -> Float[np.ndarray, "s w"]:
-    """Averages from the integrals over the spacings of samples, beyond which the last one holds."""
-    far = max(float(times[-1]) + 2 * SPAN, own[-1] + 1.0) if len(times) else own[-1] + 1.0
-    knots = np.append(own, far)
-    integral = np.cumsum(np.vstack((0 * last, steps, (far - own[-1]) * last)), axis=0)
-    late, early = (
-        np.stack([np.interp(times + by, knots, column) for column in integral.T], axis=1)
-        for by in (SPAN, -SPAN)
-    )
-    return (late - early) / (2 * SPAN)
+    middle = values[:-1] if role(stream) == "command" else 0.5 * (values[1:] + values[:-1])
+    if role(stream) == "command":
+        # The last set point holds to the end.
+        times, middle = np.append(times, times[-1] + 1e6), np.vstack((middle, values[-1]))
+    steps = np.diff(times)[:, None] * middle
+    return Averages(times, np.cumsum(np.vstack((0 * steps[0], steps)), axis=0))
 
 
 def _design(parts: list[Float[np.ndarray, "s _"]]) -> Float[np.ndarray, "s r"]:

@@ -107,6 +107,18 @@ def test_column_order_is_free_and_blank_lines_and_byte_order_mark_are_ignored(tm
     assert read_episode(path).commands[2].tolist() == [0.01, 0.01, 0.0]
 
 
+def test_whole_times_since_1970_survive_to_the_nanosecond(tmp_path):
+    path = write_files(tmp_path)
+    times = [1_700_000_000_000_000_001 + k for k in range(len(ROWS))]
+    lines = [f"{HEADER},t,big", *(f"{r},{t},{2**63}" for r, t in zip(ROWS, times, strict=True))]
+    path.write_text("\n".join(lines))
+    episode = read_episode(path)
+    assert episode.extra["t"].tolist() == times
+    assert episode.extra["big"].tolist() == [2.0**63] * len(ROWS)
+    write_episode(episode, tmp_path / "again", overwrite=True)
+    assert read_episode(tmp_path / "again.csv").extra["t"].tolist() == times
+
+
 def edit(row: int, column: str, value: str) -> list[str]:
     rows = [line.split(",") for line in ROWS]
     rows[row][HEADER.split(",").index(column)] = value
@@ -138,6 +150,14 @@ BAD_TABLES = {
     "ragged row": ([ROWS[0], ROWS[1] + ",7", ROWS[2]], ["row 1 (line 3) has 11 cells", "10"]),
     "text cell": (edit(1, "z", "high"), ["row 1 (line 3), column z", "'high'", "number"]),
     "empty cell": (edit(2, "F_z", ""), ["row 2 (line 4), column F_z", "an empty cell"]),
+    "nan below blank lines": (
+        [ROWS[0], "", "", *edit(2, "tau", "nan")[1:]], ["row 2 (line 6), column tau", "finite"],
+    ),
+    "remark above": (
+        "\n".join(["# made by it", HEADER, *ROWS]),
+        ["the first line is the remark '# made by it'", "begin with the line of names"],
+    ),
+    "units below": ([",".join(["1"] + ["m"] * 9), *ROWS], ["row 0 (line 2)", "'m'", "a number"]),
     "nan": (edit(2, "tau", "nan"), ["row 2 (line 4), column tau", "nan", "finite"]),
     "inf": (edit(1, "u_x", "-inf"), ["row 1 (line 3), column u_x", "-inf", "finite"]),
     "repeated step": ([ROWS[0], ROWS[1], ROWS[1]], ["row 2", "found 1, expected 2 (repeated)"]),

@@ -196,6 +196,9 @@ BAD_FILES = {
     "empty": ("", "the file is empty"),
     "only names": ("t,x\n", "no rows below the line of names"),
     "ragged": ("t,x\n1,2\n3\n4,5\n", "line 3 has 1 cells, expected 2"),
+    "no names": ("1,2\n3,4\n", "line 1 holds numbers, and no line above it holds names"),
+    "more names": ("t,x,y\n1,2\n3,4\n", "line 1 has 3 names, the rows below it have 2 cells"),
+    "commas for both": ("t,x\n0,5,1,5\n1,5,2,5\n", "are commas both decimal marks and separators?"),
     "twice": ("t,t\n1,2\n", "appears twice"),
     "no text": (b"\xff\xfe\x00t\x00", "cannot be read as a table"),
     "no parquet": ("t,x\n1,2\n", "cannot be read as a table"),
@@ -326,6 +329,26 @@ def test_units_are_taken_from_the_table_where_the_map_gives_none(tmp_path: Path)
     named = [*without("x", "F_z"), "x=x [mm]:m", "F_z=F_z (kN)"]
     given = log_from_columns(read_columns(path), named, path)
     assert np.allclose(given.positions[:, 0], 1e3 * SPACE["position"][:, 0], atol=1e-5)
+
+
+SMALL = {
+    "quoted decimal commas": ('"t","x"\n"0,5","1,5"\n"0,6","2,5"\n', [1.5, 2.5]),
+    "decimal commas far down": ("t;x\n" + "1;2\n" * 60_000 + "2;3,5\n", [2.0] * 60_000 + [3.5]),
+    "names and values above": ("rate,100\nmass,5\nt,x\n" + "0,1\n" * 9, [1.0] * 9),
+    "names of two lines": ("pose,pose\nt,x\n0,1\n1,2\n", [1.0, 2.0]),
+    "tabs and text above": ("Version\t2\n\nt\tx\tComment\n0,5\t1,5\t\n0,6\t1,6\t\n", [1.5, 1.6]),
+    "separator told": ("sep=;\nt;x\n1,5;2\n2,5;3\n", [2.0, 3.0]),
+    "signs": ("t,x\n0,+1.5\n1,\N{MINUS SIGN}2.5\n", [1.5, -2.5]),
+    "no numbers at first": ("t,x\nnan,nan\n1,2\n", [np.nan, 2.0]),
+    "text with blanks": ("t,label,x\n0,free motion here,1\n1,in contact,2\n", [1.0, 2.0]),
+}
+
+
+@pytest.mark.parametrize("case", SMALL)
+def test_what_loggers_write_is_read(case: str, tmp_path: Path) -> None:
+    text, expected = SMALL[case]
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    assert np.array_equal(read_columns(tmp_path / "a.csv")["x"], expected, equal_nan=True)
 
 
 EPOCH = 1_700_000_000

@@ -20,7 +20,9 @@ import numpy as np
 from tpcd.errors import EpisodeError
 
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
-WHOLE_NUMBER = re.compile(r"-?(0|[1-9]\d{0,17})")
+WHOLE_NUMBER = re.compile(r"-?(0|[1-9]\d{0,18})")
+LARGEST = 2**63
+"""Of int64, which holds nanoseconds since 1970."""
 NOT_FINITE = {"nan", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity"}
 UNIT_SUFFIX = re.compile(r"[ _\[(]+(mm|cm|m|rad|deg|degrees|mrad|n|nm|n_m|n\*m|mn|mnm)[\])]*$")
 SYNONYMS = {
@@ -115,13 +117,17 @@ def _read_csv(path: Path, required: Sequence[str]) -> Table:
             for row, cell in enumerate(cells):
                 _check_cell(path, row_name(row, path, rows[row][0]), name, cell)
             table[name] = np.array([float(cell) for cell in cells], dtype=np.float64)
-            _check_finite(path, name, table[name])
+            _check_finite(path, name, table[name], [line for line, _ in rows])
         else:
             table[name] = _free_column([cells[position] for _, cells in rows])
     return table
 
 
 def _check_names(path: Path, names: list[str], required: Sequence[str]) -> None:
+    if names[0].startswith(("#", "%", "//")):
+        raise EpisodeError(
+            path, f"the first line is the remark {names[0]!r}", "begin with the line of names"
+        )
     if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
         raise EpisodeError(path, f"header is {names[0]!r}", "separate the columns by commas")
     repeated = sorted({name for name in names if names.count(name) > 1})
@@ -161,13 +167,16 @@ def _check_cell(path: Path, row: str, name: str, cell: str) -> None:
     )
 
 
-def _check_finite(path: Path, name: str, column: np.ndarray) -> None:
+def _check_finite(
+    path: Path, name: str, column: np.ndarray, lines: Sequence[int] | None = None
+) -> None:
     bad = np.flatnonzero(~np.isfinite(column))
     if len(bad):
         row = int(bad[0])
         raise EpisodeError(
             path,
-            f"{row_name(row, path)}, column {name}: found {column[row]}, expected a finite number",
+            f"{row_name(row, path, lines[row] if lines else None)}, column {name}: found"
+            f" {column[row]}, expected a finite number",
             "drop the step from the recording or measure it again",
         )
 
@@ -176,7 +185,9 @@ def _free_column(cells: list[str]) -> np.ndarray:
     """Values of a column that is kept but not used: int, float, bool, else text as it was."""
     stripped = [cell.strip() for cell in cells]
     if all(WHOLE_NUMBER.fullmatch(cell) for cell in stripped):
-        return np.array([int(cell) for cell in stripped], dtype=np.int64)
+        whole = [int(cell) for cell in stripped]
+        if all(-LARGEST <= value < LARGEST for value in whole):
+            return np.array(whole, dtype=np.int64)
     if all(NUMBER.fullmatch(cell) or cell.lower() in NOT_FINITE for cell in stripped):
         return np.array([float(cell) for cell in stripped], dtype=np.float64)
     if all(cell in ("True", "False") for cell in stripped):

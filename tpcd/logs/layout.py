@@ -20,6 +20,7 @@ NULLS = ("", "-", "--", "?", "na", "n/a", "#n/a", "nan", "-nan", "null", "none",
 """Cells, in small letters, that say that there is no number."""
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.IGNORECASE)
 COMMA_NUMBER = re.compile(r"[+-]?(\d+(,\d+)?|,\d+)([eE][+-]?\d+)?")
+THOUSANDS = re.compile(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?")
 REMARK = re.compile(r"^\s*(#|%|//|\*)+\s*")
 SAMPLE = 400
 """So many lines from the beginning show the layout."""
@@ -100,40 +101,48 @@ def find_layout(lines: Sequence[str], more: Sequence[str] = ()) -> Layout:
         raise ValueError("the file is empty")
     separator, count = _separator([*shown, *more])
     cells = [split(line, separator) for line in shown]
-    rows = [k for k, row in enumerate(cells) if _is_row(row, count, separator)]
-    above = [k for k, line in enumerate(shown) if line.strip()]
-    if not rows:
+    rows = [len(row) == count and any(map(_looks_numeric, row)) for row in cells]
+    if not any(rows):
         # Nothing but names, or nothing that is a table.
-        return Layout(separator, tuple(split(REMARK.sub("", shown[above[-1]]), separator)),
-                      above[-1] + 1)  # fmt: skip
-    first = rows[0]
-    above = [k for k in above if k < first]
-    if not above:
-        raise ValueError(f"line {first + 1} holds numbers, and no line above it holds names")
-    headers = {k: named for k in above if (named := _names(shown[k], separator, count))}
+        last = max(k for k, line in enumerate(shown) if line.strip())
+        return Layout(separator, tuple(split(REMARK.sub("", shown[last]), separator)), last + 1)
+    headers = {
+        k: named for k, line in enumerate(shown) if (named := _names(line, separator, count))
+    }
     if not headers:
+        first = rows.index(True)
+        above = [k for k in range(first) if shown[k].strip()]
+        if not above:
+            raise ValueError(f"line {first + 1} holds numbers, and no line above it holds names")
         found = len(split(REMARK.sub("", shown[above[-1]]), separator))
-        raise ValueError(f"line {above[-1] + 1} has {found} names, the rows below it have {count}")
-    *before, last = headers
+        twice = ": are commas both decimal marks and separators?" if count == 2 * found else ""
+        raise ValueError(
+            f"line {above[-1] + 1} has {found} names, the rows below it have {count} cells{twice}"
+        )
+    # Remarks may look like a row, and a row may hold no number; but most rows are below the names.
+    last = max(headers, key=lambda k: (sum(rows[k:]) - 2 * sum(rows[:k]), k))
     names, units, notes = headers[last], (), ()
-    if before and before[-1] == last - 1 and _below_names(names):
+    if last - 1 in headers and _below_names(names):
         units = tuple(unit_word(cell) for cell in names)
         if not all(units[k] or not cell for k, cell in enumerate(names)):
             odd = next(cell for k, cell in enumerate(names) if cell and not units[k])
             notes = (f"line {last + 1} is no line of names, and {odd!r} in it is no known unit",)
-        names = headers[before[-1]]
+        names = headers[last - 1]
+    first = last + 1
     table = [row for row in [*cells[first:], *(split(line, separator) for line in more)]]
     numbers = [cell for row in table for cell in row if cell]
     commas = sum("," in cell and COMMA_NUMBER.fullmatch(cell) is not None for cell in numbers)
     points = sum("." in cell and NUMBER.fullmatch(cell) is not None for cell in numbers)
-    return Layout(separator, names, first, separator != "," and commas > points, units, notes)
+    return Layout(separator, names, first, commas > points, units, notes)
 
 
-def is_number(cell: str, separator: str = ";") -> bool:
-    """Whether a cell is a number, with a decimal comma where that is no separator."""
-    if NUMBER.fullmatch(cell):
-        return True
-    return separator != "," and COMMA_NUMBER.fullmatch(cell) is not None
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number, with a decimal point or comma."""
+    return bool(NUMBER.fullmatch(cell) or COMMA_NUMBER.fullmatch(cell))
+
+
+def _looks_numeric(cell: str) -> bool:
+    return is_number(cell) or bool(THOUSANDS.fullmatch(cell))
 
 
 def _separator(lines: Sequence[str]) -> tuple[str, int]:
@@ -141,29 +150,22 @@ def _separator(lines: Sequence[str]) -> tuple[str, int]:
     best, chosen = (-1.0, 0), (",", 1)
     for separator in SEPARATORS:
         rows = [split(line, separator) for line in lines if line.strip()]
-        counts = Counter(len(row) for row in rows if any(is_number(c, separator) for c in row))
+        counts = Counter(len(row) for row in rows if any(map(_looks_numeric, row)))
         counts = counts or Counter(len(row) for row in rows)
         count, _ = counts.most_common(1)[0]
-        if count < 2:
+        if count < 2 or (separator == " " and chosen[0] == "\t"):
             continue
         fitting = [row for row in rows if len(row) == count]
         full = sum(sum(1 for cell in row if cell) for row in fitting)
-        numbers = sum(is_number(cell, separator) for row in fitting for cell in row)
+        numbers = sum(_looks_numeric(cell) for row in fitting for cell in row)
         score = (numbers / max(full, 1) * len(fitting) / len(rows), count)
         if score > best:
             best, chosen = score, (separator, count)
     return chosen
 
 
-def _is_row(row: list[str], count: int, separator: str) -> bool:
-    """Whether most of a line's cells are numbers, or say that there is none."""
-    numbers = sum(is_number(cell, separator) for cell in row)
-    full = sum(not is_null(cell) for cell in row)
-    return len(row) == count and numbers > 0 and 2 * numbers >= full
-
-
 def _names(line: str, separator: str, count: int) -> tuple[str, ...]:
-    """Names in a line, as many as there are columns; none where it has fewer or more.
+    """Names in a line, as many as there are columns and no numbers; else none.
 
     The lines of numbers may end in a separator where that of the names does not, and the reverse;
     names may be parted otherwise, as by a blank after each comma.
@@ -175,8 +177,11 @@ def _names(line: str, separator: str, count: int) -> tuple[str, ...]:
             cells = cells[:-1]
         if len(cells) == count - 1 and line.strip() and mark == separator and count > 2:
             cells = [*cells, ""]
-        if len(cells) == count and any(cells):
-            return tuple(cells)
+        if len(cells) == count and not all(map(is_null, cells)):
+            # In a line of units, 1 stands for none.
+            numbers = [cell for cell in cells if _looks_numeric(cell)]
+            units = set(numbers) <= {"1"} and 2 * len(numbers) < len(cells)
+            return tuple(cells) if units else ()
     return ()
 
 

@@ -7,7 +7,6 @@ of lists becomes one column for each entry, numbered like those of Universal Rob
 
 from __future__ import annotations
 
-import codecs
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from tpcd.logs.layout import (
     NULLS,
+    THOUSANDS,
     Layout,
     find_layout,
     is_null,
@@ -25,9 +25,8 @@ from tpcd.logs.layout import (
     unit_of_name,
 )
 from tpcd.logs.log import LogError
+from tpcd.logs.text import encoding_of, lines_of, read_ends, read_text
 
-HEAD, TAIL = 1 << 18, 1 << 16
-"""Bytes at either end that show the layout."""
 EXACT = 2**53
 """Whole numbers up to this are exact as floats."""
 
@@ -80,6 +79,7 @@ def read_columns(path: Path) -> Table:
             columns[column] = values
             if unit:
                 columns.moments[column] = unit
+    _release()
     if not columns or not len(next(iter(columns.values()))):
         raise LogError(path, "no rows below the line of names", "export it again")
     return columns
@@ -117,7 +117,7 @@ def text_among_numbers(columns: Columns, column: str) -> tuple[str, str]:
     if is_number(cells[row]):
         mark = "commas" if comma else "points"
         return found, f"expected numbers: elsewhere in the file decimals have {mark}"
-    if re.fullmatch(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?", cells[row]):
+    if THOUSANDS.fullmatch(cells[row]):
         return found, "expected numbers without marks between the thousands"
     return found, "expected numbers, or an empty cell where there is none"
 
@@ -131,13 +131,13 @@ def _parquet(path: Path) -> Any:
 def _csv(path: Path, columns: Table) -> Any:
     from pyarrow import ArrowInvalid, csv, py_buffer, string
 
-    columns.encoding = encoding = _encoding(path)
-    head, tail = _ends(path, encoding)
+    columns.encoding = encoding = encoding_of(path)
+    head, tail = read_ends(path, encoding)
     if not head.strip():
         raise ValueError("the file is empty")
     # A cut line at the end of the sample, or at the beginning of the tail, shows no layout.
     whole = not tail
-    layout = find_layout(_lines(head)[: None if whole else -1], _lines(tail)[1:])
+    layout = find_layout(lines_of(head)[: None if whole else -1], lines_of(tail)[1:])
     names = [name or f"column {k + 1}" for k, name in enumerate(layout.names)]
     columns.layout = layout
     columns.units = {n: u for n, u in zip(names, layout.units, strict=False) if u and u != "1"}
@@ -145,7 +145,7 @@ def _csv(path: Path, columns: Table) -> Any:
     source: Any = str(path)
     old = "\n" not in head
     if encoding not in ("utf-8", "utf-8-sig") or layout.separator == " " or old:
-        text = _text_of(path, encoding)
+        text = read_text(path, encoding)
         if layout.separator == " ":
             text = re.sub(r"(?m)^ | $", "", re.sub(r"[ \t]+", " ", text))
         source = py_buffer(text.encode())
@@ -163,7 +163,7 @@ def _csv(path: Path, columns: Table) -> Any:
             csv.ReadOptions(column_names=names, skip_rows=layout.first),
             csv.ParseOptions(delimiter=layout.separator, invalid_row_handler=ragged),
             csv.ConvertOptions(
-                decimal_point="," if layout.comma else ".",
+                decimal_point="," if layout.comma and layout.separator != "," else ".",
                 null_values=[*NULLS, *(n.upper() for n in NULLS), "NaN", "Nan", "None", "Null"],
                 column_types=kinds,
             ),
@@ -181,60 +181,6 @@ def _csv(path: Path, columns: Table) -> Any:
     return table.drop_columns([n for n in empty if not layout.names[names.index(n)]])
 
 
-def _encoding(path: Path) -> str:
-    """The encoding of a text file: by its mark, by zeros, or by whether all of it is UTF-8."""
-    with path.open("rb") as file:
-        head = file.read(1000)
-        for mark, encoding in (
-            (codecs.BOM_UTF8, "utf-8-sig"),
-            (codecs.BOM_UTF32_LE, "utf-32"),
-            (codecs.BOM_UTF16_LE, "utf-16"),
-            (codecs.BOM_UTF16_BE, "utf-16"),
-        ):
-            if head.startswith(mark):
-                return encoding
-        for encoding, zeros in (("utf-16-le", head[1::2]), ("utf-16-be", head[::2])):
-            if zeros and 2 * zeros.count(0) > len(zeros):
-                return encoding
-        decoder = codecs.getincrementaldecoder("utf-8")()
-        try:
-            decoder.decode(head)
-            while part := file.read(1 << 20):
-                decoder.decode(part)
-            decoder.decode(b"", final=True)
-        except UnicodeDecodeError:
-            return "cp1252"
-    return "utf-8"
-
-
-def _ends(path: Path, encoding: str) -> tuple[str, str]:
-    """The beginning of a text file, and the end of one that is longer."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-        size = file.seek(0, 2)
-        if size <= HEAD:
-            return head.decode(encoding, "replace" if encoding == "cp1252" else "strict"), ""
-        wide = 4 if "32" in encoding else 2
-        file.seek(max(HEAD, size - TAIL) // wide * wide)
-        tail = file.read()
-    bare = encoding if encoding[-2:] in ("le", "be") or "16" not in encoding else "utf-16-le"
-    if encoding == "utf-16" and head.startswith(codecs.BOM_UTF16_BE):
-        bare = "utf-16-be"
-    bare = "utf-32-le" if encoding == "utf-32" else bare
-    return head.decode(encoding, "replace"), tail.decode(bare, "replace")
-
-
-def _text_of(path: Path, encoding: str) -> str:
-    """All of a text file, with a line feed at the end of each line."""
-    errors = "replace" if encoding == "cp1252" else "strict"
-    with path.open(encoding=encoding, errors=errors) as file:
-        return file.read()
-
-
-def _lines(text: str) -> list[str]:
-    return re.split("\r\n|\n|\r", text)
-
-
 def _fits(line: str, layout: Layout) -> bool:
     return len(split(line, layout.separator)) == len(layout.names)
 
@@ -245,7 +191,7 @@ def _passed_over(odd: list[str], path: Path, encoding: str, layout: Layout) -> t
     Raises `ValueError` for any other.
     """
     notes, remarks = [], sum(text.lstrip()[:1] in ("#", "%") for text in odd)
-    text = _text_of(path, encoding)
+    text = read_text(path, encoding)
     for number, line in enumerate(text.split("\n"), start=1):
         if number <= layout.first or not line.strip() or _fits(line, layout):
             continue
@@ -313,7 +259,7 @@ def _text(name: str, column: Any, layout: Layout | None) -> tuple[str, np.ndarra
     known = compute.is_in(lowered, value_set=_nulls())
     bare = compute.if_else(known, scalar(None, string()), bare)
     plain = compute.replace_substring(bare, "\N{MINUS SIGN}", "-")
-    if layout is not None and layout.separator != "," and layout.comma:
+    if layout is not None and layout.comma:
         plain = compute.replace_substring(plain, ",", ".")
         if compute.any(compute.match_substring(bare, ".")).as_py():
             plain = bare
@@ -331,6 +277,13 @@ def _text(name: str, column: Any, layout: Layout | None) -> tuple[str, np.ndarra
     return name, np.array([str(value) for value in column.to_pylist()], dtype=np.str_), ""
 
 
+def _release() -> None:
+    """Give back what pyarrow keeps for its next table, which may be as large as this one."""
+    from pyarrow import default_memory_pool
+
+    default_memory_pool().release_unused()
+
+
 def _compute() -> Any:
     import pyarrow.compute
 
@@ -346,4 +299,4 @@ def _nulls() -> Any:
 def _plain(cell: str, comma: bool) -> bool:
     """Whether a cell is a number with the decimal mark of the file."""
     bare = cell.strip().replace("\N{MINUS SIGN}", "-")
-    return is_number(bare, ",") if not comma else "." not in bare and is_number(bare, ";")
+    return is_number(bare) and ("." if comma else ",") not in bare

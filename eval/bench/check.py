@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import lfilter
 
 from tpcd.cli import check_numbers, run
 from tpcd.results import format_table
@@ -48,7 +49,8 @@ def made(rows: int, seed: int) -> dict[str, np.ndarray]:
     targets = np.cumsum(0.01 * random.standard_normal((hold[-1] + 1, 3)), axis=0) % 0.2
     command = targets[hold]
     away = 0.02 * np.sin(0.7 * hold)[:, None] * np.ones(3)
-    pose = command + away + 1e-5 * random.standard_normal((rows, 3))
+    pose = lfilter([0.02], [1.0, -0.98], command + away, axis=0)
+    pose = np.asarray(pose) + 1e-5 * random.standard_normal((rows, 3))
     wrench = np.hstack((100.0 * away, 0.5 * away)) + 0.05 * random.standard_normal((rows, 6))
     wrench[rows // 3 : rows // 3 + 2000, 2] = wrench[rows // 3, 2]
     wrench[:, 0] = np.minimum(wrench[:, 0], 2.0)

@@ -12,15 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tpcd.data.checks import FREE_OF_NOISE, check_episode, repeated_readings
-from tpcd.data.episode import COLUMNS, Episode
-from tpcd.data.files import locate, read_episode
-from tpcd.data.noise import check_noise
-from tpcd.errors import EpisodeError
 from tpcd.logs.bags import is_bag, read_bag
 from tpcd.logs.columns import log_from_columns, parse_map, read_numbers
 from tpcd.logs.log import Log, LogError
-from tpcd.logs.table import Columns, read_columns
+from tpcd.logs.table import Table, read_columns
 from tpcd.quality.finding import Finding, Weight, usable
 from tpcd.quality.identify import identify
 from tpcd.quality.noise import RestNoise, check_noise_at_rest, noise_at_rest
@@ -84,7 +79,9 @@ def check_file(
     if topics:
         raise ValueError("topics are for bags; name a table's columns with --map")
     if not entries and _is_episode(path):
-        return _check_rows(path)
+        from tpcd.commands.checked_rows import check_rows_of  # episodes are tensors
+
+        return check_rows_of(path)
     columns = read_columns(path)
     suggestion = suggest_map(columns)
     used = tuple(entries) or suggestion.entries
@@ -113,15 +110,14 @@ def _is_episode(path: Path) -> bool:
     """Whether a path names an episode: a table with its YAML beside it."""
     if path.is_dir() and (path / "metadata.yaml").is_file():
         return False
-    try:
-        return locate(path)[1].is_file()
-    except EpisodeError:
-        return False
+    if path.is_dir():
+        return any(file.suffix == ".yaml" for file in path.iterdir())
+    return path.suffix == ".yaml" or path.with_suffix(".yaml").is_file()
 
 
 def _read_table(
     path: Path,
-    columns: Columns,
+    columns: Table,
     entries: Sequence[str],
     euler: str,
     rate: float | None,
@@ -129,6 +125,8 @@ def _read_table(
 ) -> tuple[Log | None, tuple[Stream, ...], str]:
     """The recording of a table; without a pose or a wrench, its streams and what it lacks."""
     mapped = parse_map(entries, columns, path)
+    for name in set(columns) - {column for column, _ in mapped.values()}:
+        del columns[name]  # of a million rows they are worth their memory
     if "time" not in mapped and rate is None:
         # The order of the samples is all that is known; what takes seconds counts samples.
         rate = 1.0
@@ -156,7 +154,7 @@ def _recorded(stream: Stream, missing: frozenset[str]) -> Stream:
 
 
 def _streams(
-    path: Path, columns: Columns, mapped: dict[str, tuple[str, str]], rate: float | None
+    path: Path, columns: Table, mapped: dict[str, tuple[str, str]], rate: float | None
 ) -> tuple[Stream, ...]:
     """What the map gives, as one stream for set points and one for the rest."""
     values, _ = read_numbers(columns, mapped, path)
@@ -191,46 +189,6 @@ def _checked(
     return Checked(
         path, "recording", tuple(streams), found, noises, quantities, problem, notes=tuple(notes)
     )
-
-
-def _check_rows(path: Path) -> Checked:
-    """An episode: its rows, and what they tell of arm and sensor."""
-    episode = read_episode(path)
-    repeats = repeated_readings(episode)
-    told = {str(each) for each in repeats}
-    doubts = [sentence for sentence in check_episode(episode) if sentence not in told]
-    try:
-        doubts += check_noise(episode)
-    except EpisodeError as error:
-        doubts.append(error.problem)
-    findings = (*repeats, *(Finding("row", _weight(each), each) for each in doubts))
-    stream = _rows_stream(episode)
-    table = dict(zip(stream.channels, stream.values.T, strict=True)) | {"time": stream.times}
-    log = log_from_columns(
-        table,
-        ["time=time", *(f"{name}={name}" for name in stream.channels)],
-        episode.path or path,
-    )
-    quantities = identify(replace(log, findings=()), tuple(episode.stiffness.tolist()))
-    return Checked(episode.path or path, "episode", (stream,), findings, quantities=quantities)
-
-
-def _weight(sentence: str) -> Weight:
-    """What is said of an episode without noise, as a simulated one is, is no doubt."""
-    return Weight.NOTE if sentence.endswith(FREE_OF_NOISE) else Weight.DOUBT
-
-
-def _rows_stream(episode: Episode) -> Stream:
-    """The rows as samples, at their times where these are known, else a second apart."""
-    values = np.column_stack(
-        (episode.commands.numpy(), episode.poses.numpy(), episode.wrenches.numpy())
-    )
-    times = np.arange(len(episode), dtype=np.float64)
-    recorded = episode.extra.get("time_s")
-    if recorded is not None and recorded.dtype.kind == "f" and (np.diff(recorded) > 0).all():
-        times = recorded - recorded[0]
-    name = episode.path.name if episode.path else "episode"
-    return Stream(name, COLUMNS[1:], times, values)
 
 
 def _own(stream: Stream) -> set[str]:

@@ -7,10 +7,9 @@ import base64
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from tpcd.commands.check_rows import (
     CLOCK_KINDS,
@@ -25,14 +24,16 @@ from tpcd.commands.check_rows import (
 )
 from tpcd.commands.checked import Checked
 from tpcd.commands.verdict import verdict
-from tpcd.figures.recording import Trace, channels_over_time, clocks_over_time
-from tpcd.figures.sinks import save_figure
-from tpcd.figures.style import display_unit
 from tpcd.files import write_json, write_text
 from tpcd.quality.channels import ROTATIONS, UNITS, WRENCH
 from tpcd.quality.finding import Finding, Weight
 from tpcd.quality.stream import Stream
 from tpcd.results import format_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tpcd.figures.recording import Trace
 
 FEWEST_DRAWN = 2
 """Samples below which nothing is drawn."""
@@ -59,6 +60,8 @@ def written_page(checked: Checked) -> str:
 
 def write_check(checked: Checked, folder: Path) -> Path:
     """Write check.txt, check.json, pictures and check.html into a run folder; returns the page."""
+    from tpcd.figures.sinks import save_figure  # figures import torch, a page of text does not
+
     code, sentence = verdict(checked)
     write_text(folder / "check.txt", written_page(checked) + "\n")
     content = {
@@ -114,6 +117,8 @@ def render_page(checked: Checked, images: dict[str, tuple[str, str]]) -> str:
 
 def draw_check(checked: Checked) -> dict[str, tuple[Figure, str]]:
     """Pictures over time, each with its caption."""
+    from tpcd.figures.recording import channels_over_time, clocks_over_time
+
     drawn: dict[str, tuple[Figure, str]] = {}
     names = shown_names(checked.streams)
     groups = {
@@ -168,6 +173,9 @@ def _clocks(checked: Checked) -> dict[str, Stream]:
 
 def _trace(checked: Checked, name: str) -> Trace | None:
     """One channel with its set point and what was found in it."""
+    from tpcd.figures.recording import Trace
+    from tpcd.figures.style import display_unit
+
     found = _column(checked.streams, name)
     if found is None or len(found[0]) < FEWEST_DRAWN:
         return None

@@ -20,6 +20,8 @@ FAR = 20.0
 LEAST = {"m": 0.02, "rad": 0.2}
 """and at least so long [m, rad]: an arm does not get so far from one sample to the next."""
 NEARLY_ALL = 0.995
+AT_ONCE = 2.0
+"""A jump within so many samples of one of the set point is a command."""
 
 
 def check_poses(streams: Sequence[Stream]) -> tuple[Finding, ...]:
@@ -28,7 +30,7 @@ def check_poses(streams: Sequence[Stream]) -> tuple[Finding, ...]:
     for stream in streams:
         for prefix in ("", "u_"):
             found += _quaternions(stream, prefix)
-        found += _jumps(stream)
+        found += _jumps(stream, streams)
     return tuple(found)
 
 
@@ -79,23 +81,28 @@ def _quaternions(stream: Stream, prefix: str) -> Iterator[Finding]:
         )
 
 
-def _jumps(stream: Stream) -> Iterator[Finding]:
+def _jumps(stream: Stream, streams: Sequence[Stream]) -> Iterator[Finding]:
     """Places and rotations that no arm gets to from one sample to the next."""
     entries = _columns(stream, QUATERNION)
     names: tuple[str, ...] = tuple(n for n in ("x", "y", "z") if n in stream.channels)
     places = _columns(stream, names) if names else None
     if places is not None:
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        yield from _told_jumps(stream, names, steps, "m")
+        yield from _told_jumps(stream, names, steps, "m", _sent(streams, names))
     if entries is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             units = entries / np.linalg.norm(entries, axis=1, keepdims=True)
         same = np.abs((units[1:] * units[:-1]).sum(1))
-        yield from _told_jumps(stream, QUATERNION, 2.0 * np.arccos(np.minimum(same, 1.0)), "rad")
+        turns = 2.0 * np.arccos(np.minimum(same, 1.0))
+        yield from _told_jumps(stream, QUATERNION, turns, "rad", _sent(streams, QUATERNION))
 
 
 def _told_jumps(
-    stream: Stream, names: tuple[str, ...], steps: Float[np.ndarray, " s"], unit: str
+    stream: Stream,
+    names: tuple[str, ...],
+    steps: Float[np.ndarray, " s"],
+    unit: str,
+    sent: Float[np.ndarray, " c"],
 ) -> Iterator[Finding]:
     spacing = np.diff(stream.times)
     known = np.isfinite(steps)
@@ -108,6 +115,10 @@ def _told_jumps(
     back = np.zeros_like(jumps)
     back[1:] = jumps[1:] & jumps[:-1]
     far = np.flatnonzero(jumps & ~back & ~np.append(back[1:], False))
+    # An arm without dynamics jumps with its set point.
+    begun = np.searchsorted(sent, stream.times[far] - AT_ONCE * np.median(spacing))
+    ended = np.searchsorted(sent, stream.times[far + 1], "right")
+    far = far[begun == ended]
     if len(far):
         k = int(far[np.argmax(steps[far])])
         more = f", and {len(far) - 1} times more" if len(far) > 1 else ""
@@ -123,6 +134,17 @@ def _told_jumps(
             (k, k + 2),
             "cut the recording there, or leave out what does not belong to it",
         )
+
+
+def _sent(streams: Sequence[Stream], names: Sequence[str]) -> Float[np.ndarray, " c"]:
+    """Times at which the set point of some channels changes by as much as a jump."""
+    for stream in streams:
+        columns = _columns(stream, [f"u_{name}" for name in names])
+        if columns is not None:
+            least = LEAST["rad"] / 2.0 if names[0] == "qx" else LEAST["m"]
+            far = np.linalg.norm(np.diff(columns, axis=0), axis=1) > least
+            return stream.times[1:][far]
+    return np.empty(0)
 
 
 def _runs(marked: Bool[np.ndarray, " n"]) -> Iterator[tuple[int, int]]:

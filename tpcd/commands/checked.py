@@ -16,7 +16,7 @@ from tpcd.logs.bags import is_bag, read_bag
 from tpcd.logs.columns import log_from_columns, parse_map, read_numbers
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.table import Table, read_columns
-from tpcd.quality.finding import Finding, Weight, usable
+from tpcd.quality.finding import Finding, usable
 from tpcd.quality.identify import identify
 from tpcd.quality.noise import RestNoise, check_noise_at_rest, noise_at_rest
 from tpcd.quality.quantity import Quantity

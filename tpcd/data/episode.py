@@ -65,8 +65,9 @@ class Episode:
         for name in ("commands", "poses"):
             check_pose(name, getattr(self, name), self.unusual)
         for name, column in self.extra.items():
-            if name in COLUMNS or np.shape(column) != (n,):
-                raise ValueError(f"extra column {name!r} must be new and of length {n}")
+            if name in COLUMNS or np.shape(column) != (len(self),):
+                told = f"extra column {name!r} must be new and of length {len(self)}"
+                raise ValueError(told)
 
     def __len__(self) -> int:
         """Number of rows, the start row included."""

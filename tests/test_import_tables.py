@@ -19,9 +19,9 @@ from tpcd.data.measured import Measured
 from tpcd.logs.columns import UNITS, log_from_columns
 from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import Log, LogError
-from tpcd.logs.suggest import suggest_map
 from tpcd.logs.table import read_columns
 from tpcd.quality.finding import Weight
+from tpcd.quality.suggest import suggest_map
 
 SETTING = Setting(
     base=Rotation.from_euler("xyz", [0.3, 0.5, 2.0]), tool=Rotation.from_euler("x", 3.0)
@@ -502,10 +502,8 @@ def test_without_a_map_the_columns_are_listed_and_a_map_is_suggested(tmp_path: P
         log_from_columns(named, (), tmp_path / "a.csv")
     told = str(caught.value)
     assert "F_x, F_z, time, x, z not in the map; the columns are 'Timestamp (s)', TCP_Pos_X" in told
-    tried = [entry.strip("'") for entry in suggest_map(named)]
-    assert "--map " + " ".join(suggest_map(named)) in told
-    same(log_from_columns(named, [*tried, *(f"T_{n.lower()}=Mom{n}" for n in "XYZ")],
-                          tmp_path / "a.csv"))  # fmt: skip
+    assert suggest_map(named).line in told
+    same(log_from_columns(named, suggest_map(named).entries, tmp_path / "a.csv"))
 
 
 def test_a_table_of_streams_with_other_clocks_is_mended_on_request(tmp_path: Path) -> None:

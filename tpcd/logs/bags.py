@@ -16,7 +16,6 @@ import numpy as np
 from tpcd.logs.joining import join
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.recorded import Recorded, common_clock, places
-from tpcd.logs.suggest import COMMAND_WORDS
 from tpcd.quality.stream import Stream
 
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
@@ -28,6 +27,18 @@ CHANNELS = {
     "command": tuple(f"u_{name}" for name in _POSE),
 }
 SUFFIXES = (".bag", ".mcap", ".db3")
+COMMAND_WORDS = (
+    "command",
+    "cmd",
+    "target",
+    "desired",
+    "setpoint",
+    "set_point",
+    "reference",
+    "goal",
+    "equilibrium",
+)
+"""A topic whose name has one of these is taken for the set point."""
 
 
 def is_bag(path: Path) -> bool:

@@ -28,10 +28,10 @@ import numpy as np
 
 from tpcd.logs.joining import join
 from tpcd.logs.log import Log, LogError
-from tpcd.logs.suggest import suggest_map
 from tpcd.logs.table import Columns, Table, place, text_among_numbers, units_of
 from tpcd.quality.clocks import JUMP
 from tpcd.quality.stream import Stream
+from tpcd.quality.suggest import suggest_map
 
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}
@@ -216,10 +216,10 @@ def _check_map(
     if "time" not in names and rate is None:
         lacking |= {"time"}
     if lacking:
-        fitting = [entry for entry in suggest_map(columns) if entry.split("=")[0] not in names]
+        fitting = suggest_map(columns).without(names).line
         remedy = f"the columns are {_listed(columns)}"
         if fitting:
-            remedy += f"; by their names, try --map {' '.join(fitting)}"
+            remedy += f"; by names and numbers, try {fitting}"
         time = "; give --rate in Hz where there are no times" if "time" in lacking else ""
         raise LogError(path, f"{', '.join(sorted(lacking))} not in the map", remedy + time)
     missing = {n for n in (*"xyz", "F_x", "F_y", "F_z", "T_x", "T_y", "T_z") if n not in names}

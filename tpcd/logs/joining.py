@@ -17,9 +17,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tpcd.logs.log import Log, LogError
-from tpcd.quality.clocks import check_clocks
 from tpcd.quality.delay import estimate_delays
 from tpcd.quality.finding import Finding, Weight, overlapping
+from tpcd.quality.recording import check_recording
 from tpcd.quality.stream import Stream, find_gaps, forward, read, role
 
 ROTATIONS = {
@@ -94,7 +94,7 @@ def join(
     moved = tuple(replace(part, times=part.times - zero) for part in parts.values())
     given = [_earlier(each, zero) for each in (*findings, *told)]
     found = []
-    for each in check_clocks(moved):
+    for each in check_recording(moved):
         # Where pieces were put together no samples can be, and that is told.
         seam = overlapping(each.start or 0.0, each.end or 0.0, given)
         found += [] if each.kind == "gap" and seam else [each]

@@ -30,7 +30,7 @@ UNITS = {
     **dict.fromkeys(TORQUES, "N·m"),
 }
 """SI units of channels; quaternions have none."""
-MIXED = np.sqrt([1.0, 2.0, 3.0, 5.0])
+MIXED = np.sqrt([1.0, 2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0])
 """A sum with these weights changes where any of its parts does."""
 MOST_LISTED = 6
 TOGETHER = 2

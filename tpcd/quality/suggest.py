@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +26,8 @@ EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """Times since 1970 in each unit are larger than this."""
 SLOWEST = 2.0
 """Samples further apart than this [s] were timed in another unit."""
+FIRST = {"pose": "x", "command": "u_x", "wrench": "F_x"}
+"""Groups of columns, and the first entry of each."""
 SERVO = "target_TCP_pose"
 """Of Universal Robots' RTDE; under an admittance loop it is not the set point of the impedance."""
 
@@ -44,6 +46,12 @@ class Suggestion:
         """The option, ready to paste; empty where nothing was found."""
         words = " ".join(shlex.quote(entry) for entry in self.entries)
         return f"--map {words}" if words else ""
+
+    def without(self, names: Collection[str]) -> Suggestion:
+        """The suggestion for what is not mapped yet."""
+        known = {*names, *(group for group, first in FIRST.items() if first in names)}
+        left = tuple(entry for entry in self.entries if entry.partition("=")[0] not in known)
+        return replace(self, entries=left)
 
 
 def suggest_map(columns: Mapping[str, np.ndarray]) -> Suggestion:

@@ -20,8 +20,8 @@ OTHER = _set(
     " motor raw jerk"
 )
 """Words of columns that are none of these, unless a word of a place says so beside `current`."""
-FORCE = _set("force forces f")
-TORQUE = _set("torque torques moment moments t m")
+FORCE = _set("force forces frc f")
+TORQUE = _set("torque torques trq moment moments mom t m")
 WRENCH = _set("wrench wrenches ft loadcell")
 PLACE = _set("position positions pos p tcp pose poses ee eef cartesian translation")
 TURNED = _set("orientation ori quaternion quat q rotation rot")

@@ -209,6 +209,7 @@ def test_the_page_is_what_its_results_say_and_holds_no_samples() -> None:
 
     # Intervals are the longest runs of numbers.
     assert longest(results["recordings"]) <= 2
+    assert "folder" not in results["versions"] and "out" not in results["config"]
 
 
 needs_sets = pytest.mark.skipif(measured_folder() is None, reason=f"{FOLDER_VARIABLE} is not set")

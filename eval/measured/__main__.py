@@ -46,24 +46,25 @@ def evaluate_measured(config: Measurements) -> None:
     from eval.measured.pivoting import read_held
     from eval.measured.sets import FOLDER_VARIABLE, measured_folder, recordings
     from tpcd.errors import FileError
-    from tpcd.results import open_run, write_results
+    from tpcd.results import run_folder, write_results
 
     folder = measured_folder()
     if folder is None:
         raise FileError(
             Path(FOLDER_VARIABLE), "is not set", "set it to the folder of the measured sets"
         )
-    out = open_run(config.out, "python -m eval.measured", config, config.overwrite)
-    found: list[dict[str, Any]] = []
-    for recording in recordings(folder, out / "tables"):
-        print(recording.name, flush=True)
-        found.append(_measured(recording, out))
-    held = [read_held(p) for p in sorted((folder / "pbal_impedance").glob("*Stiffness*.json"))]
-    print("pbal", flush=True)
-    found.append(_pivoted(held, config, out))
-    write_results(out, [], recordings=found, seeds=[config.seed])
-    write_page(out / "results.json", out / "README.md")
-    print(f"page in {out / 'README.md'}")
+    command = "python -m eval.measured"
+    with run_folder(config.out, command, config, config.overwrite) as out:
+        found: list[dict[str, Any]] = []
+        for recording in recordings(folder, out / "tables"):
+            print(recording.name, flush=True)
+            found.append(_measured(recording, out))
+        files = sorted((folder / "pbal_impedance").glob("*Stiffness*.json"))
+        print("pbal", flush=True)
+        found.append(_pivoted([read_held(path) for path in files], config, out))
+        write_results(out, [], recordings=found, seeds=[config.seed])
+        write_page(out / "results.json", out / "README.md")
+    print(f"page in {config.out / 'README.md'}")
 
 
 def _measured(recording: Recording, out: Path) -> dict[str, Any]:

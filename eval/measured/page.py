@@ -1,6 +1,6 @@
 """The page of results: every figure in it comes from `results.json`.
 
-python -m eval.measured.page RESULTS.json PAGE.md
+python -m eval.measured.page runs/measured puts page and results of a run beside this file.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tpcd.files import read_json, write_text
+from tpcd.files import read_json, write_json, write_text
 from tpcd.quality.quantity import Quantity
 
 HEAD = """# Real recordings
 
-`TPCD_MEASURED=FOLDER python -m eval.measured --out runs/measured` writes this page from the
-`results.json` beside it. The recordings are other people's (sources below), three of them without a
-licence: they are read where they are, and nothing of them is shipped but the figures here.
-Intervals hold the truth at the level stated, if the model of the arm and the sensor does.
+`TPCD_MEASURED=FOLDER python -m eval.measured --out runs/measured` measures, and
+`python -m eval.measured.page runs/measured` writes this page from the `results.json` beside it. The
+recordings are other people's (sources below), most of them without a licence: they are read where
+they are, and nothing of them is shipped but the figures here. Intervals hold the truth at the level
+stated, if the model of arm and sensor (`tpcd/quality`) does.
 """
 SOURCES = {
     "ati_static_poses": "ATI Axia80 on an arm, a tool of about 1.1 kg, no contact"
@@ -37,22 +38,45 @@ def write_page(results: Path, page: Path) -> None:
     write_text(page, page_text(read_json(results)))
 
 
+def publish(run: Path, folder: Path) -> None:
+    """Page and results of a run, without places of the machine that it ran on."""
+    results = read_json(run / "results.json")
+    results["config"].pop("out", None)
+    results["versions"].pop("folder", None)
+    write_json(folder / "results.json", results)
+    write_page(folder / "results.json", folder / "README.md")
+
+
 def page_text(results: Mapping[str, Any]) -> str:
     """The page as Markdown."""
-    parts = [HEAD]
+    parts = [HEAD, _summary(results["recordings"])]
     for each in results["recordings"]:
         parts.append(f"## {each['name']}\n\n{SOURCES[each['set']]}; {each['samples']} samples.\n")
         parts += [" ".join(each["notes"]) + "\n"] if each["notes"] else []
         parts += [_known(each["known"])] if each["known"] else []
         parts += [_balance(each["balance"])] if "balance" in each else []
-        parts += [
-            _checked(each["checked"]),
-            _told(each["told"]),
-            *(_said(command) for command in each["commands"]),
-        ]
-    versions = results["versions"]
-    parts.append(f"Revision {versions['git']}, {versions['date_utc']}.\n")
+        parts += [_checked(each["checked"]), _told(each["told"])]
+        parts += [_said(command) for command in each["commands"]]
+    git = results["versions"]["git"] or {}
+    parts.append(f"Revision {git.get('revision')}, {results['versions']['date_utc']}.\n")
     return "\n".join(parts)
+
+
+def _summary(recordings: Sequence[Mapping[str, Any]]) -> str:
+    lines = [
+        "| recording | check | quantities told | known values held | exit codes |",
+        "|---|---|---|---|---|",
+    ]
+    for each in recordings:
+        told = sum(row["value"] is not None for row in each["told"])
+        held = sum(row["holds"] for row in each["known"])
+        known = f"{held} of {len(each['known'])}" if each["known"] else "–"
+        codes = ", ".join(f"{Path(row['command']).stem} {row['code']}" for row in each["commands"])
+        count = f"{told} of {len(each['told'])}"
+        lines.append(
+            f"| {each['name']} | {each['checked']['verdict']} | {count} | {known} | {codes} |"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def _quantity(row: Mapping[str, Any]) -> Quantity:
@@ -129,4 +153,4 @@ def _balance(found: Mapping[str, Mapping[str, float]]) -> str:
 
 
 if __name__ == "__main__":
-    write_page(Path(sys.argv[1]), Path(sys.argv[2]))
+    publish(Path(sys.argv[1]), Path(__file__).parent)

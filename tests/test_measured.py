@@ -177,6 +177,15 @@ def test_check_and_import_of_a_made_set_leave_figures_and_no_places(tmp_path: Pa
     assert str(tmp_path) not in json.dumps([checked, imported])
 
 
+def test_rows_too_far_apart_for_an_import_are_told_so_and_no_command_is_missed(tmp_path) -> None:
+    _written_sets(tmp_path / "sets")
+    static = recordings(tmp_path / "sets", tmp_path / "tables")[0]
+    said = _imported(static, tmp_path)
+    assert said["code"] == 2
+    assert any("the 8 samples of a row: they come every 10 s" in line for line in said["said"])
+    assert not any("command" in line for line in said["said"])
+
+
 def test_places_of_this_machine_are_left_out_of_lines() -> None:
     line = "episode in /home/me/runs/measured/import/episode.csv, from /data/sets/a.csv"
     told = placeless(line, ["/home/me/runs/measured", "/data/sets"])

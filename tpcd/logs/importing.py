@@ -25,7 +25,7 @@ from tpcd.errors import EpisodeError
 from tpcd.logs.findings import Account, compare_readings, left_out, spring_wrench
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog, Plane, WrenchReading, project
-from tpcd.logs.settled import Settled, Stillness, find_settled
+from tpcd.logs.settled import BLOCKS, Settled, Stillness, find_settled
 from tpcd.quality.finding import Weight
 
 FREE_FORCE = 1.0
@@ -147,6 +147,13 @@ def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
     if len(settled.rows) > 1 or (settled.commands is None and len(settled.rows)):
         return
     window = choices.stillness.window
+    if settled.commands is None and not settled.broken:
+        each = float(np.median(np.diff(log.times)))
+        raise LogError(
+            log.path,
+            f"no {window:g} s hold the {2 * BLOCKS} samples of a row: they come every {each:.3g} s",
+            "raise --window, or record faster",
+        )
     found = f"{len(settled.rows)} settled steps in {log.times[-1]:.3g} s"
     if settled.broken:
         problem = f"{len(settled.broken)} of them lie in what is left out"

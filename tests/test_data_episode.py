@@ -58,6 +58,7 @@ def episodes(draw) -> Episode:
         object=draw(st.none() | text),
         notes=draw(st.none() | text),
         time_step_s=draw(st.none() | positive),
+        unusual=True,
         priors=draw(
             st.fixed_dictionaries({}, optional={"friction": st.just((0.1, 1 / 3)),
                                                 "wall_position": st.just((0.1, 0.2))})
@@ -293,7 +294,7 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path):
     wrenches[1, 2] = float("nan")
     bad = [
         replace(episode, wrenches=wrenches),
-        replace(episode, stiffness=-episode.stiffness),
+        replace(episode, sensor_std=-episode.sensor_std),
         replace(episode, priors={"friction": (0.9, 0.1)}),
     ]
     for broken in bad:
@@ -325,8 +326,9 @@ def test_the_record_refuses_wrong_shapes_and_types(tmp_path):
     # TypeError instead where jaxtyping checks the annotations, as it does in tests.
     with pytest.raises((ValueError, TypeError), match="poses"):
         replace(episode, poses=episode.poses[:2])
-    with pytest.raises(ValueError, match="float32"):
-        replace(episode, commands=episode.commands.float())
+    with pytest.raises(ValueError, match="stiffness is"):
+        replace(episode, stiffness=-episode.stiffness)
+    assert replace(episode, commands=episode.commands.float()).commands.dtype == torch.float64
     with pytest.raises(ValueError, match="extra column"):
         replace(episode, extra={"speed": np.zeros(2)})
 
@@ -362,8 +364,8 @@ def test_an_inverted_wrench_is_a_warning_and_a_right_one_is_none(tmp_path):
     with pytest.raises(
         EpisodeError, match=r"F_z is 0\.00\d+ times .*, expected about 1; check the"
     ):
-        check_units(replace(episode, stiffness=stiffness * 1000))
-    (warning,) = check_episode(replace(episode, stiffness=stiffness * 1000))
+        check_units(replace(episode, stiffness=stiffness * 1000, unusual=True))
+    (warning,) = check_episode(replace(episode, stiffness=stiffness * 1000, unusual=True))
     assert "check the stiffness" in warning
     degrees = torch.tensor([1, 1, 180 / torch.pi], dtype=torch.float64)
     turned = episode.poses.clone()

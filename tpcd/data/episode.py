@@ -52,15 +52,16 @@ class Episode:
 
     def __post_init__(self) -> None:
         cpu = torch.device("cpu")
-        rows = ("commands", "poses", "wrenches")
-        for name in (*rows, "stiffness", "sensor_std"):
-            last, axes = (6 if name == "sensor_std" else 3), (2 if name in rows else 1)
-            value = as_numbers(name, getattr(self, name), last, device=cpu).double()
-            n = len(self.commands) if name in rows else last
-            if value.ndim != axes or len(value) != n:
-                shape = (n, last) if axes == 2 else (last,)
-                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")
+        for name, last in {"stiffness": 3, "sensor_std": 6}.items():
+            value = as_numbers(name, getattr(self, name), last, axes=1, device=cpu)
+            object.__setattr__(self, name, value.double())
+        for name in ("commands", "poses", "wrenches"):
+            value = as_numbers(name, getattr(self, name), 3, device=cpu).double()
             object.__setattr__(self, name, value)
+            shape = (len(self.commands), 3)
+            if tuple(value.shape) != shape:
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")
+        n = len(self.commands)
         check_stiffness(self.stiffness, self.unusual)
         for name in ("commands", "poses"):
             check_pose(name, getattr(self, name), self.unusual)

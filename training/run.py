@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import platform
-import tempfile
+import shutil
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -54,16 +54,18 @@ def train(config: TrainingConfig, out: Path, export: Path, resume: bool = False)
     kept = fit(module, prepared, config, out, resume, began)
     outlines = dict(zip(prepared.names, prepared.vertices, strict=True))
     network = module.network.eval().requires_grad_(False)
-    with tempfile.TemporaryDirectory(dir=out, prefix=".unmeasured-") as folder:
-        try:
-            unmeasured = export_prior(network, prepared, config, Path(folder) / export.name, kept)
-        except TrainingError as error:
-            began_with, ended_with = kept.first_loss, kept.last_loss
-            raise TrainingError(
-                f"{error} or with other rates: the loss went from {began_with:.3g} to "
-                f"{ended_with:.3g} in {kept.steps_done} steps"
-            ) from error
+    unmeasured = out / ".unmeasured"
+    try:
+        export_prior(network, prepared, config, unmeasured, kept)
         return complete_card(unmeasured, outlines, config, out, export)
+    except TrainingError as error:
+        began_with, ended_with = kept.first_loss, kept.last_loss
+        raise TrainingError(
+            f"{error} or with other rates: the loss went from {began_with:.3g} to "
+            f"{ended_with:.3g} in {kept.steps_done} steps"
+        ) from error
+    finally:
+        shutil.rmtree(unmeasured, ignore_errors=True)
 
 
 def export_prior(

@@ -15,7 +15,7 @@ from training.config import OptimConfig
 DIVERGED = 100.0
 """A loss of more than so many times the first one has diverged: the first is that of random
 weights, whose outlines are as wrong as outlines are large, and it is a mean square, so these are
-ten times as wrong. Trainings that lead somewhere stay below two."""
+ten times as wrong."""
 
 
 class TrainingError(TpcdError):

@@ -61,7 +61,6 @@ class Episode:
             shape = (len(self.commands), 3)
             if tuple(value.shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")
-        n = len(self.commands)
         check_stiffness(self.stiffness, self.unusual)
         for name in ("commands", "poses"):
             check_pose(name, getattr(self, name), self.unusual)

@@ -194,6 +194,26 @@ def test_set_points_hold_until_the_next_one_comes(tmp_path: Path) -> None:
     assert kinds(log, Weight.LEFT_OUT) == []
 
 
+@pytest.mark.parametrize(("end", "rows"), [(5.5, 8), (9.3, 7), (100.0, 2)])
+def test_a_sender_that_says_its_set_point_again_and_falls_silent_holds_nothing(
+    end: float, rows: int, tmp_path: Path
+) -> None:
+    # The arm goes on to set points that nobody recorded: at the end of the silence it rests
+    # elsewhere than at the last one known.
+    path = write_bag(
+        "ros2",
+        tmp_path / "a",
+        SPACE,
+        keep=lambda role, time: role != "command" or not 5.0 < time < end,
+    )
+    log = read_bag(path)
+    found = imported(log)
+    assert len(found.settled.rows) == rows
+    assert {each.kind for each in log.findings if each.weight is Weight.LEFT_OUT} == {
+        "early_end" if end == 100.0 else "gap"
+    }
+
+
 def test_what_comes_before_the_first_and_after_the_last_is_told(tmp_path: Path) -> None:
     path = write_bag(
         "ros2", tmp_path / "a", SPACE,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tpcd.quality.clocks import check_clocks, check_jumps, clock_jumps
 from tpcd.quality.delay import estimate_delays
 from tpcd.quality.finding import Finding, Weight, overlapping, usable
-from tpcd.quality.stream import Stream, find_gaps, forward
+from tpcd.quality.stream import Stream, find_gaps, forward, gaps_of
 
 POSE, WRENCH, COMMAND = ("x", "y", "z"), ("F_x", "F_y", "F_z"), ("u_x", "u_y", "u_z")
 
@@ -59,22 +59,34 @@ def test_gaps_do_not_depend_on_when_a_recording_began(spacings: list[float], sin
     assert np.allclose(find_gaps(times + 2.0**20) - 2.0**20, find_gaps(times), atol=1e-6)
 
 
-def test_samples_without_numbers_are_a_gap_and_set_points_have_none() -> None:
+def test_samples_without_numbers_are_a_gap() -> None:
     times = np.arange(1000) / 100
     values = np.ones((1000, 3))
     values[300:520, 1] = np.nan
-    wrench = Stream("/ft", WRENCH, times, values)
-    command = Stream("/to", COMMAND, times, values)
-    found = [each for each in check_clocks([wrench, command]) if each.kind in ("gap", "silent")]
-    gap, silent = found
-    assert gap.weight is Weight.LEFT_OUT and silent.weight is Weight.NOTE
-    assert (gap.start, gap.end) == (2.99, 5.2) == (silent.start, silent.end)
+    (gap,) = (f for f in check_clocks([Stream("/ft", WRENCH, times, values)]) if f.kind == "gap")
+    assert gap.weight is Weight.LEFT_OUT and (gap.start, gap.end) == (2.99, 5.2)
     assert gap.sentence.startswith("/ft: no wrench from 2.99 to 5.20 s")
-    assert "is taken to hold" in silent.sentence
-    kept = usable(times, found)
+    kept = usable(times, [gap])
     assert not kept[300:520].any() and kept[:299].all() and kept[521:].all()
     # A stretch that only touches the gap is whole; one that lies inside, where nothing is, is not.
-    assert not overlapping(5.2, 6.0, found) and overlapping(3.5, 3.6, found)
+    assert not overlapping(5.2, 6.0, [gap]) and overlapping(3.5, 3.6, [gap])
+
+
+def test_silence_of_set_points_is_a_gap_only_of_a_sender_that_says_them_again() -> None:
+    times = np.delete(np.arange(1000) / 100, np.arange(300, 520))
+    again = Stream("/to", COMMAND, times, np.repeat(np.arange(78), 10)[:, None] * np.ones(3))
+    once = Stream("/to", COMMAND, times, np.arange(780)[:, None] * np.ones(3))
+    assert np.allclose(gaps_of(again), [[2.99, 5.2]])
+    assert len(gaps_of(once)) == 0
+    pose = stream(np.arange(2000) / 100, POSE)
+    ends = [[f.kind for f in check_clocks([pose, part])] for part in (again, once)]
+    assert "early_end" in ends[0] and "early_end" not in ends[1]
+
+
+def test_samples_too_rare_to_know_rest_by_are_doubted_or_gaps() -> None:
+    rare = stream(np.arange(60.0))
+    assert [f.weight for f in check_clocks([rare]) if f.kind == "rate"] == [Weight.DOUBT]
+    assert len(find_gaps(3.0 * np.arange(60.0))) == 59
 
 
 def test_short_stretches_without_numbers_are_none() -> None:
@@ -110,7 +122,8 @@ def test_of_two_clocks_the_one_that_jumped_is_at_fault(size: float) -> None:
 
 def test_what_is_missing_at_either_end_is_left_out() -> None:
     times = np.arange(1000) / 100
-    parts = [stream(times, POSE), stream(times[200:700]), stream(times[100::5], COMMAND)]
+    command = Stream("/to", COMMAND, times[100:900], np.arange(800.0)[:, None] * np.ones(3))
+    parts = [stream(times, POSE), stream(times[200:700]), command]
     told = {(each.kind, *each.channels[:1]): each for each in check_clocks(parts)}
     assert told["late_start", "F_x"].end == 2.0 and told["late_start", "u_x"].end == 1.0
     assert told["early_end", "F_x"].start == 6.99

@@ -20,7 +20,7 @@ from tpcd.logs.log import Log, LogError
 from tpcd.quality.delay import estimate_delays
 from tpcd.quality.finding import Finding, Weight, overlapping
 from tpcd.quality.recording import check_recording
-from tpcd.quality.stream import Stream, find_gaps, forward, read, role
+from tpcd.quality.stream import MOST_GAP, Stream, forward, gaps_of, read, role, says_again
 
 ROTATIONS = {
     "rotation vector": ("rx", "ry", "rz"),
@@ -69,7 +69,7 @@ def join(
     parts = {role(stream): stream for stream, _ in turns}
     parts, told = _moved(parts, dict(delays or {}))
     pose, wrench, command = parts["pose"], parts["wrench"], parts.get("command")
-    _check_overlap(path, list(parts.values()))
+    _check_overlap(path, list(parts.values()), [note for _, note in turns if note])
     fresh = forward(pose.times)
     again = int((np.diff(pose.times) == 0).sum())
     if again:
@@ -80,7 +80,7 @@ def join(
     values = dict(zip(pose.channels, own.T, strict=True))
     values.update(zip(wrench.channels, _interpolated(wrench, at, findings).T, strict=True))
     if command is not None:
-        values.update(zip(command.channels, _held(command, at).T, strict=True))
+        values.update(zip(command.channels, _held(command, at, findings).T, strict=True))
     good = functools.reduce(np.logical_and, (np.isfinite(column) for column in values.values()))
     if good.sum() < 2:
         raise LogError(
@@ -165,7 +165,7 @@ def _moved(
     return parts, told
 
 
-def _check_overlap(path: Path, parts: Sequence[Stream]) -> None:
+def _check_overlap(path: Path, parts: Sequence[Stream], notes: Sequence[str]) -> None:
     for part in parts:
         if not read(part).any():
             channels = ", ".join(
@@ -176,7 +176,8 @@ def _check_overlap(path: Path, parts: Sequence[Stream]) -> None:
             raise LogError(
                 path,
                 f"{part.name} has no sample with all of {', '.join(part.channels)}"
-                + (f" ({channels} hold no number at all)" if channels else ""),
+                + (f" ({channels} hold no number at all)" if channels and not notes else "")
+                + "".join(f": {note}" for note in notes),
                 "check the map of columns",
             )
     spans = {p.name: p.times[read(p)] for p in parts}
@@ -201,20 +202,27 @@ def _interpolated(
     share = np.divide(times - own[before], width, out=np.zeros(len(times)), where=width > 0)
     found = values[before] + share[:, None] * (values[after] - values[before])
     found[(times < own[0]) | (times > own[-1])] = np.nan
-    numbers = own[np.isfinite(values).all(1)]
     cuts = [(each.start, each.end) for each in findings if overlapping(-np.inf, np.inf, [each])]
-    for start, end in [*find_gaps(numbers).tolist(), *cuts]:
+    for start, end in [*gaps_of(stream).tolist(), *cuts]:
         found[(times > start) & (times < end)] = np.nan
     return found
 
 
-def _held(stream: Stream, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n w"]:
+def _held(
+    stream: Stream, times: Float[np.ndarray, " n"], findings: Sequence[Finding]
+) -> Float[np.ndarray, "n w"]:
     """The last values at some times; NaN before the first."""
     own, values = _forward(stream)
     if np.array_equal(own, times):
         return values
     last = np.searchsorted(own, times, side="right") - 1
-    return np.where(last[:, None] < 0, np.nan, values[np.maximum(last, 0)])
+    found = np.where(last[:, None] < 0, np.nan, values[np.maximum(last, 0)])
+    for start, end in gaps_of(stream).tolist():
+        # Between pieces of a recording that were put together the set point is that before.
+        if not overlapping(start, end, findings):
+            found[(times > start) & (times < end)] = np.nan
+    again = says_again(stream)
+    return np.where((times > own[-1] + MOST_GAP)[:, None] & again, np.nan, found)
 
 
 def _forward(stream: Stream) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k w"]]:

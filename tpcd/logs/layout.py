@@ -59,6 +59,8 @@ class Layout:
     """Index of the first line of numbers, from 0."""
     comma: bool = False
     """Whether the decimal mark is a comma."""
+    whole: bool = False
+    """Whether no number shown had a decimal mark, so that it may be either."""
     units: tuple[str, ...] = ()
     """Units by the line below the names, "" where they are not known."""
     notes: tuple[str, ...] = ()
@@ -133,7 +135,7 @@ def find_layout(lines: Sequence[str], more: Sequence[str] = ()) -> Layout:
     numbers = [cell for row in table for cell in row if cell]
     commas = sum("," in cell and COMMA_NUMBER.fullmatch(cell) is not None for cell in numbers)
     points = sum("." in cell and NUMBER.fullmatch(cell) is not None for cell in numbers)
-    return Layout(separator, names, first, commas > points, units, notes)
+    return Layout(separator, names, first, commas > points, not commas + points, units, notes)
 
 
 def is_number(cell: str) -> bool:

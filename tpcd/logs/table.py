@@ -259,7 +259,7 @@ def _text(name: str, column: Any, layout: Layout | None) -> tuple[str, np.ndarra
     known = compute.is_in(lowered, value_set=_nulls())
     bare = compute.if_else(known, scalar(None, string()), bare)
     plain = compute.replace_substring(bare, "\N{MINUS SIGN}", "-")
-    if layout is not None and layout.comma:
+    if layout is not None and (layout.comma or layout.whole):
         plain = compute.replace_substring(plain, ",", ".")
         if compute.any(compute.match_substring(bare, ".")).as_py():
             plain = bare

@@ -1,8 +1,7 @@
 """Clocks of a recording: jumps, gaps, rates, and when its streams begin and end.
 
 Nothing is interpolated over a gap. A sample that holds no number is none, so a column that is
-empty for seconds, a topic that stops and a table whose rows stop are one kind. A set point holds
-until the next one comes: silence of commands is no gap.
+empty for seconds, a topic that stops and a table whose rows stop are one kind.
 """
 
 from __future__ import annotations
@@ -14,11 +13,13 @@ from jaxtyping import Float, Int
 
 from tpcd.quality.delay import check_delays
 from tpcd.quality.finding import Finding, Weight
-from tpcd.quality.stream import FEW, LEAST_GAP, Stream, find_gaps, forward, read, role
+from tpcd.quality.stream import FEW, LEAST_GAP, Stream, forward, gaps_of, read, role, says_again
 
 JUMP = 0.05
 """Two clocks that part by more than this from one sample to the next have jumped [s]. What arrives
 late or in another order by less is a matter of the network."""
+SLOW = 0.25
+"""Samples that come more rarely than this are too few to know an arm at rest by [s]."""
 SOON = 10
 """Two clocks that agree again on average over so many samples have not parted."""
 
@@ -32,25 +33,13 @@ def check_clocks(streams: Sequence[Stream]) -> tuple[Finding, ...]:
 
 
 def check_gaps(stream: Stream) -> list[Finding]:
-    """Times in which a pose or wrench has no samples; those of set points are only noted."""
-    times = stream.times[read(stream)]
-    kind = role(stream)
-    gaps = find_gaps(times[forward(times)])
-    if not len(gaps):
-        return []
-    usual = float(np.median(np.diff(times)))
-    if kind == "command":
-        start, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
-        sentence = (
-            f"{stream.name}: set points come every {_seconds(usual)}, but not from {start:.2f} to"
-            f" {end:.2f} s{_more(len(gaps) - 1)}; the last one is taken to hold"
-        )
-        return [Finding("silent", Weight.NOTE, sentence, stream.channels, start, end)]
+    """Times in which a stream has no samples."""
+    times, kind = stream.times[read(stream)], role(stream)
     told = []
-    for start, end in gaps.tolist():
+    for start, end in gaps_of(stream).tolist():
         sentence = (
             f"{stream.name}: no {kind} from {start:.2f} to {end:.2f} s ({end - start:.2g} s, where"
-            f" samples come every {_seconds(usual)})"
+            f" samples come every {_seconds(float(np.median(np.diff(times))))})"
         )
         told.append(Finding("gap", Weight.LEFT_OUT, sentence, stream.channels, start, end))
     return told
@@ -67,7 +56,10 @@ def check_rate(stream: Stream) -> list[Finding]:
         f"{stream.name}: {role(stream)} every {_seconds(usual)} (98 % within {_seconds(low)} to"
         f" {_seconds(high)})"
     )
-    return [Finding("rate", Weight.NOTE, sentence, stream.channels)]
+    if usual > SLOW:
+        sentence += ": between its samples a straight line is drawn"
+    weight = Weight.DOUBT if usual > SLOW else Weight.NOTE
+    return [Finding("rate", weight, sentence, stream.channels)]
 
 
 def check_jumps(stream: Stream) -> list[Finding]:
@@ -120,7 +112,7 @@ def _check_ends(streams: Sequence[Stream]) -> list[Finding]:
     )
     told = []
     for stream, span in zip(streams, spans, strict=True):
-        usual = float(np.median(np.abs(np.diff(span)))) if len(span) > 1 else 0.0
+        usual = float(np.quantile(np.abs(np.diff(span)), 0.95)) if len(span) > 1 else 0.0
         limit = max(LEAST_GAP, FEW * usual)
         kind = role(stream)
         begin, end = float(span.min()), float(span.max())
@@ -132,7 +124,7 @@ def _check_ends(streams: Sequence[Stream]) -> list[Finding]:
             told.append(
                 Finding("late_start", Weight.LEFT_OUT, sentence, stream.channels, -np.inf, begin)
             )
-        if kind != "command" and last - end > limit:
+        if last - end > limit and (kind != "command" or says_again(stream)):
             sentence = (
                 f"{stream.name}: no {kind} comes in the last {last - end:.2f} s, which are not used"
             )
@@ -144,7 +136,3 @@ def _check_ends(streams: Sequence[Stream]) -> list[Finding]:
 
 def _seconds(value: float) -> str:
     return f"{value:.3g} s" if value >= 1 else f"{1e3 * value:.3g} ms"
-
-
-def _more(count: int) -> str:
-    return f" and {count} times more" if count else ""

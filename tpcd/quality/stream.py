@@ -11,6 +11,10 @@ FEW = 4.0
 """A spacing of so many usual ones is a gap."""
 LEAST_GAP = 0.05
 """Shorter than this nothing is a gap [s]: an arm that is pulled by springs moves along a line."""
+MOST_GAP = 2.0
+"""Longer than this everything is a gap [s]: an arm makes whole moves meanwhile."""
+AGAIN = 0.2
+"""A sender of set points of which this part repeats the one before says again what it holds."""
 NEAR = 50
 """Spacings on either side that say what is usual."""
 ENOUGH = 5
@@ -51,6 +55,24 @@ def forward(times: Float[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
     return np.concatenate(([True], times[1:] > latest[:-1])) if len(times) else np.ones(0, bool)
 
 
+def gaps_of(stream: Stream) -> Float[np.ndarray, "g 2"]:
+    """Last sample before every gap of a stream, and first one after it [s].
+
+    A set point holds until the next one comes, so silence is no gap; but where the sender says
+    again and again what it holds, silence is of the sender, and no one knows what it would say.
+    """
+    if role(stream) == "command" and not says_again(stream):
+        return np.empty((0, 2))
+    times = stream.times[read(stream)]
+    return find_gaps(times[forward(times)])
+
+
+def says_again(stream: Stream) -> bool:
+    """Whether the samples of a stream repeat what holds."""
+    values = stream.values[read(stream)]
+    return len(values) > 1 and float((values[1:] == values[:-1]).all(1).mean()) >= AGAIN
+
+
 def find_gaps(times: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g 2"]:
     """Last sample before every gap, and first one after it [s]; times must increase.
 
@@ -64,7 +86,7 @@ def find_gaps(times: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g 2"]:
         return np.empty((0, 2))
     before, after = _usual(spacings, wide, -NEAR), _usual(spacings, wide, 1)
     usual = np.nan_to_num(np.fmax(before, after), nan=float(np.median(spacings)))
-    found = wide[spacings[wide] > np.maximum(LEAST_GAP, FEW * usual)]
+    found = wide[spacings[wide] > np.clip(FEW * usual, LEAST_GAP, MOST_GAP)]
     return np.stack((times[found], times[found + 1]), axis=1)
 
 

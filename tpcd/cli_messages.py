@@ -63,11 +63,9 @@ def file_of(error: OSError) -> str | None:
 
     What closes the files of a full disk fails once more, without a name: the first error counts.
     """
-    found: BaseException | None = error
-    while isinstance(found, OSError) and found.errno == error.errno and found.filename is None:
-        found = found.__context__
-    same = isinstance(found, OSError) and found.errno == error.errno
-    file = found.filename if same else None
+    file, cause = error.filename, error.__context__
+    while file is None and isinstance(cause, OSError) and cause.errno == error.errno:
+        file, cause = cause.filename, cause.__context__
     return os.fsdecode(file) if isinstance(file, (str, bytes, os.PathLike)) else None
 
 

@@ -108,19 +108,15 @@ MAY_CHANGE = (
 
 def explore_with_robot(config: Experiment) -> None:
     """Explore an object with a UR arm and write belief, episode and raw readings to a folder."""
-    import signal
-
     import torch
 
     from tpcd.commands.exploring import EPISODE_NAME, Stage, explore_in_folder
     from tpcd.commands.exploring import MAY_CHANGE as ALWAYS
     from tpcd.data.files import episode_contents
+    from tpcd.robot.held_signals import kill_as_ctrl_c
     from tpcd.robot.ur import FRAME_FILE, UniversalRobot
 
     torch.set_num_threads(1)
-    for number in (signal.SIGTERM, signal.SIGHUP):  # As Ctrl-C: the arm is seen to first.
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.default_int_handler)
     settings = _settings(config)
     commands = None if config.commands is None else _commands(config.commands)
     if commands is not None:
@@ -140,7 +136,8 @@ def explore_with_robot(config: Experiment) -> None:
         )
 
     resumable = f"raw/{FRAME_FILE}"
-    explore_in_folder(config, "scripts/robot.py", stage, resumable, (*ALWAYS, *MAY_CHANGE))
+    with kill_as_ctrl_c():
+        explore_in_folder(config, "scripts/robot.py", stage, resumable, (*ALWAYS, *MAY_CHANGE))
 
 
 def _settings(config: Experiment) -> ArmSettings:

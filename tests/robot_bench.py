@@ -162,7 +162,7 @@ class Springy(Link):
 
 def wired_arm(
     folder: Path,
-    start: tuple[float, float, float] | None = None,
+    start: np.ndarray | None = None,
     confirm: Callable[[str], bool] = lambda _: True,
     arm: dict[str, Any] | None = None,
     **changed: Any,
@@ -172,7 +172,7 @@ def wired_arm(
     settings = emulator_settings(**changed)
     controller = Controller(settings)
     if start is not None:
-        controller._target = controller._actual = np.array(start)
+        controller._target = controller._actual = start
         controller._delayed = deque([controller._actual] * len(controller._delayed))
         controller._load = controller._sense()
     stated = {"surface_mm_per_10n": settings.surface_mm_per_10n, **(arm or {})}

@@ -18,21 +18,27 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import torch
-from robot_bench import Springy, command, raw_of, touching, wired_arm
+from robot_bench import Springy, command, raw_of, wired_arm
 
 import tpcd.files
+from tpcd.belief.paper import PaperSettings
+from tpcd.commands import exploration_run
 from tpcd.data.episode import Episode
 from tpcd.errors import RobotError
+from tpcd.exploration import Estimator, explore
+from tpcd.policies.protocol import Choice, Situation
 from tpcd.robot import guard, held_signals, raw, ur
 from tpcd.robot import link as link_module
 from tpcd.robot import servo as servo_module
 from tpcd.robot.admittance import at_rest
 from tpcd.robot.arm_settings import ArmSettings
-from tpcd.robot.held_signals import HeldSignals
+from tpcd.robot.held_signals import HeldSignals, kill_as_ctrl_c
+from tpcd.robot.protocol import stopped_first
 from tpcd.robot.raw import RawRecord
 from tpcd.robot.servo import Servo
 from tpcd.robot.settling import SettlingSettings
 from tpcd.robot.ur import UniversalRobot
+from tpcd.shape.checkpoint import load_prior
 
 TRACED = [module.__file__ for module in (guard, held_signals, link_module, raw, servo_module, ur)]
 """What these call is arithmetic, a part of their lines."""
@@ -358,6 +364,26 @@ def test_a_handler_of_the_user_is_called_and_the_move_goes_on_if_it_returns(tmp_
         signal.signal(signal.SIGINT, before)
 
 
+def test_a_kill_in_a_move_is_as_ctrl_c_and_only_meanwhile(tmp_path: Path) -> None:
+    arm, link = pressing(tmp_path)
+    read = link.next_sample
+
+    def killed() -> Any:
+        if link.sent == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return read()
+
+    link.next_sample = killed  # type: ignore[method-assign]
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with kill_as_ctrl_c(), pytest.raises(KeyboardInterrupt, match="has retreated|holds"):
+            arm.settle(PRESSING)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    check_rest(arm, link, 1.5)
+
+
 def test_signals_are_held_in_the_main_thread_alone(ctrl_c: None) -> None:
     found: list[object] = []
 
@@ -408,79 +434,102 @@ def test_letting_go_of_an_arm_leaves_what_it_pressed_on(tmp_path: Path) -> None:
     assert arm.at_rest == "the arm has retreated" and link.force == 0.0 and not link.alive
 
 
-@pytest.mark.parametrize("fails", ["on_row", "estimator", "policy", "caller"])
-def test_what_fails_between_two_moves_stops_the_arm_first(fails: str, tmp_path: Path) -> None:
-    from tpcd.exploration import explore
-    from tpcd.policies.protocol import Choice
-
+@pytest.mark.parametrize("fails", ["on_row", "estimator", "policy"])
+def test_what_fails_between_two_moves_stops_the_arm_first(
+    fails: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arm, link = pressing(tmp_path)
     start = torch.tensor(PRESSED, dtype=torch.float64)
-    episode = Episode(
-        start[None], start[None], torch.zeros(1, 3), torch.tensor([100.0, 100.0, 50.0]),
-        torch.full((6,), 1e-3),
-    )  # fmt: skip
-    arm.start = lambda: episode  # type: ignore[method-assign]
+    std = torch.full((6,), 1e-3, dtype=torch.float64)
+    stiffness = command(100.0, 100.0, 50.0)
+    monkeypatch.setattr(
+        arm, "start", lambda: Episode(start[None], start[None], 0 * start[None], stiffness, std)
+    )
+    pressed: list[float] = []
 
     def failing(*_: object) -> Any:
-        if fails != "policy":
-            assert link.force > 1.05
+        pressed.append(link.force)
         raise OSError(*FULL.args)
 
-    class Stub:
-        def choose(self, *_: object) -> Choice:
+    class Further:
+        def choose(self, situation: Situation, generator: torch.Generator) -> Choice:
             return failing() if fails == "policy" else Choice(PRESSING)
 
-        def before(self, *_: object) -> None:
-            return None
-
-        def steps(self, *_: object) -> Any:
-            return failing() if fails == "estimator" else iter([EstimationStub()])
-
-    class EstimationStub:
-        belief = state = None
-
-    steps = explore(
-        arm, Stub(), Stub(), 0, on_row=failing if fails == "on_row" else None  # type: ignore[arg-type]
-    )  # fmt: skip
-    if fails == "caller":
-        next(steps)
-        steps.close()  # Who has enough of the moves may still have the arm.
-        assert arm.at_rest is None
-        return
+    if fails == "estimator":
+        monkeypatch.setattr(Estimator, "steps", failing)
+    estimator = Estimator(load_prior("ycb21-z2"), "paper", paper=PaperSettings(particles=20))
+    steps = explore(arm, Further(), estimator, 0, on_row=failing if fails == "on_row" else None)
     with pytest.raises(OSError, match="No space left"):
         next(steps)
-    assert arm.at_rest == "the arm has retreated" and link.force == 0.0
+    assert pressed[0] > 0.9 and link.force == 0.0
+    assert arm.at_rest == "the arm has retreated"
 
 
-@pytest.mark.parametrize("reading", [3, 60, 150])
-def test_on_the_emulator_too_the_arm_comes_away(reading: int, tmp_path: Path) -> None:
-    from robot_bench import emulator_settings
+def test_who_has_enough_of_the_moves_may_still_have_the_arm() -> None:
+    stopped: list[bool] = []
 
-    for error in errors():
-        arm, controller = wired_arm(tmp_path, arm={"still_time": 0.5})
-        episode = arm.start()
-        x, z, _ = episode.poses[0].tolist()
-        arm.settle(command(x, z - 0.04))
-        assert controller._sense()[2] > 1.0
-        link, left = arm._link, [reading]
-        assert link is not None
-        read = link.next_sample
+    def moves() -> Iterator[int]:
+        with stopped_first(lambda: stopped.append(True)):
+            yield 1
+            yield 2
 
-        def failing(error: BaseException = error, left: list[int] = left, read: Any = read) -> Any:
-            left[0] -= 1
-            if left[0] == 0:
-                raise error
-            return read()
+    steps = moves()
+    assert next(steps) == 1
+    del steps
+    assert not stopped
 
-        link.next_sample = failing  # type: ignore[method-assign]
-        began = controller.time
-        with pytest.raises((RobotError, RuntimeError, KeyboardInterrupt)):
-            arm.settle(command(x + 0.02, z - 0.06))
-        assert arm.at_rest == "the arm has retreated"
-        assert controller.time - began < reading / 125.0 + STATED_TIME
+
+def test_a_run_lets_go_of_the_arm_before_its_files_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+
+    class Run:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def __enter__(self) -> Run:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            order.append("files")
+
+    def steps() -> Iterator[Any]:
+        raise OSError(*FULL.args)
+        yield
+
+    monkeypatch.setattr(exploration_run, "EstimationRun", Run)
+    stopping = exploration_run.Stopping(3)
+    with pytest.raises(OSError, match="No space left"):
+        exploration_run.run_exploration(
+            steps(), stopping, "", tmp_path, let_go=lambda: order.append("arm")
+        )
+    assert order == ["arm", "files"]
+
+
+@pytest.mark.parametrize(("reading", "kind"), [(3, 0), (60, 1), (150, 2)])
+def test_on_the_emulator_too_the_arm_comes_away(reading: int, kind: int, tmp_path: Path) -> None:
+    arm, controller = wired_arm(tmp_path, arm={"still_time": 0.5})
+    x, z, _ = arm.start().poses[0].tolist()
+    arm.settle(command(x, z - 0.04))
+    assert controller._sense()[2] > 1.0
+    link = arm._link
+    assert link is not None
+    read, left = link.next_sample, iter(range(reading - 1))
+
+    def failing() -> Any:
+        assert arm._guard.servo is not None
+        if next(left, None) is None and not arm._guard.servo.halted:
+            raise errors()[kind]
+        return read()
+
+    link.next_sample = failing  # type: ignore[method-assign]
+    began = controller.time
+    with pytest.raises((RobotError, RuntimeError, KeyboardInterrupt)):
+        arm.settle(command(x + 0.02, z - 0.06))
+    assert arm.at_rest == "the arm has retreated"
+    assert controller.time - began < reading / 125.0 + STATED_TIME
+    for _ in range(50):
         controller.advance()
-        for _ in range(50):
-            controller.advance()
-        assert np.abs(controller._speed).max() == 0.0
-        assert np.abs(controller._sense()[:3]).max() == 0.0
-    assert touching(emulator_settings(), force_z=1.0)[1] < z
+    assert np.abs(controller._speed).max() == 0.0
+    assert np.abs(controller._sense()[:3]).max() == 0.0

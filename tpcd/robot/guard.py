@@ -36,6 +36,8 @@ class Guard:
         self.row = 0
         """The row that is being measured, for the record."""
         self._folder, self._left, self._leaving = folder, False, threading.RLock()
+        self._retreat: RawRecord | None = None
+        """Readings of the retreat, until they are kept."""
 
     def move(self, name: str, steps: Callable[[], Made], **about: Any) -> Made:
         """Make a move and record it as `name` with what is said `about` it.
@@ -114,7 +116,7 @@ class Guard:
             self.at_rest, ended = HOLDS, None
             try:
                 if servo is not None and servo.state is not None and servo.link.alive:
-                    servo.record = RawRecord()
+                    servo.record = self._retreat = RawRecord()
                     servo.retreat()
                     self.at_rest = RETREATED
             except BaseException as error:
@@ -124,10 +126,11 @@ class Guard:
             return ended
 
     def _keep_retreat(self) -> None:
-        if self.servo is not None and self.servo.state is not None:
+        with self._leaving:
+            record, self._retreat = self._retreat, None
+        if record is not None:
             about = {"row": self.row, "ended": self.at_rest}
-            unkept = self._keep(self.servo.record, "retreat", about)
-            self.at_rest = f"{self.at_rest}{unkept}"
+            self.at_rest = f"{self.at_rest}{self._keep(record, 'retreat', about)}"
 
     def _keep(self, record: RawRecord, name: str, about: dict[str, Any]) -> str:
         """Write readings; what kept them from it, to be added to a message."""

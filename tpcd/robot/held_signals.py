@@ -10,7 +10,8 @@ from __future__ import annotations
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -18,6 +19,22 @@ NUMBERS = tuple(
     getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)
 )
 """Let go of in this order, the likeliest one last."""
+
+
+@contextmanager
+def kill_as_ctrl_c() -> Iterator[None]:
+    """A block in which `kill` and a terminal that closes are as Ctrl-C, where nothing else is said
+    of them: by themselves they would end the program and leave the arm where it presses."""
+    before = {
+        number: signal.signal(number, signal.default_int_handler)
+        for number in NUMBERS
+        if signal.getsignal(number) is signal.SIG_DFL
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class HeldSignals:

@@ -6,6 +6,7 @@ recorded, whatever the arm is doing.
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -82,7 +83,9 @@ class Servo:
         """Where the arm is sent; None while it is only read."""
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
-        self._over, self._retreating, self._slower = 0, False, 0
+        self._over, self._slower = 0, 0
+        self._retreating: int | None = None
+        """Thread that makes the arm retreat."""
         self._felt: deque[np.ndarray] = deque(maxlen=max(1, round(RECENT * link.rate)))
         """Sizes of the last forces (2) [N]."""
         self._command: np.ndarray | None = None
@@ -163,7 +166,8 @@ class Servo:
         """
         assert self.state is not None, "never moved"
         settings, here = self.settings, self.state.reference
-        self._retreating = True  # The limit may be exceeded still: the ramp looks to the force.
+        # The limit may be exceeded still: the ramp looks to the force.
+        self._retreating = threading.get_ident()
         felt = np.max(self._felt, axis=0) if self._felt else None
         left = -1.0 if float(self.state.wrench[0]) < -1.0 else 0.0
         low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
@@ -174,7 +178,7 @@ class Servo:
                 self.ramp_to(goal, RETREAT_FORCE, felt)
                 here, felt = self.state.reference, None
         finally:
-            self._retreating = False
+            self._retreating = None
         return here
 
     def settle(self, command: Float[np.ndarray, " 3"]) -> Reading:
@@ -246,7 +250,7 @@ class Servo:
 
     def _send(self, reference: Float[np.ndarray, " 3"]) -> None:
         """The next target of the position servo, unless the arm was stopped meanwhile."""
-        if self.halted and not self._retreating:
+        if self.halted and self._retreating != threading.get_ident():
             raise RobotError("the arm was told to stop")
         self.link.servo(tcp_of(self.frame, reference))
 

@@ -12,14 +12,15 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from tpcd.logs.log import Log
+from tpcd.logs.log import AXES, Log
 from tpcd.quality.blocks import block_edges, correlation_time
 from tpcd.quality.impedance import NAMES, PRESS, computed, impedance
 from tpcd.quality.load import weigh
 from tpcd.quality.parity import Parity, spring_wrench
 from tpcd.quality.payload import ORIENTATIONS, payload, useless
-from tpcd.quality.quantity import Quantity, untold
+from tpcd.quality.quantity import Quantity, quantity, untold
 from tpcd.quality.rests import UP, Observed, find_rests, observe_rests, recorded_axes
 from tpcd.quality.springs import springs
 
@@ -49,7 +50,31 @@ def identify(log: Log, stiffness: Sequence[float] | None = None) -> tuple[Quanti
     if computed(parity):
         return told
     load = _from_parity(parity, stiffness)
+    turn = _sensor_turn(load)
+    if turn is not None:
+        # A turned sensor reads less than the whole force along an axis, by the square of the turn.
+        straight = springs(_unturned(log, parity.frame, turn))
+        assert straight is not None
+        _, told = impedance(straight, stiffness)
     return (*told, *load)
+
+
+def _sensor_turn(load: Sequence[Quantity]) -> Rotation | None:
+    """Rotation of the sensor where it is told in all axes, and is told apart from none."""
+    found = [quantity(load, f"sensor_rotation_{axis}") for axis in AXES]
+    values = [each.value for each in found if isinstance(each.value, float)]
+    intervals = [each.interval for each in found if each.interval is not None]
+    if len(values) < 3 or all(low <= 0.0 <= high for low, high in intervals):
+        return None
+    return Rotation.from_rotvec(values)
+
+
+def _unturned(log: Log, frame: str, turn: Rotation) -> Log:
+    """The recording with the wrench as a sensor along the end effector's axes would read it."""
+    back = turn.inv()
+    if frame == "world":
+        back = log.rotations * back * log.rotations.inv()
+    return replace(log, forces=back.apply(log.forces), torques=back.apply(log.torques))
 
 
 def _from_rests(log: Log) -> tuple[Quantity, ...]:

@@ -119,3 +119,13 @@ def test_creep_at_rest_is_measured() -> None:
     assert told["F_z"].creep == pytest.approx(0.4, rel=0.1)
     assert told["F_z"].creep_time == pytest.approx(40.0, rel=0.05)
     assert told["F_x"].creep == 0.0
+
+
+def test_an_arm_that_jumps_with_its_set_point_follows_it() -> None:
+    stream = made_stream()
+    moved = stream.values.copy()
+    moved[3000:, stream.channels.index("x")] += 0.3
+    commanded = moved.copy()
+    commanded[3000:, stream.channels.index("u_x")] += 0.3
+    assert [f.kind for f in check_poses([replace(stream, values=moved)])] == ["jump"]
+    assert check_poses([replace(stream, values=commanded)]) == ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +24,7 @@ MOST_LISTED = 8
 _ORDER = (Weight.SERIOUS, Weight.DOUBT, Weight.LEFT_OUT, Weight.NOTE)
 
 
+@functools.lru_cache(maxsize=1)  # asked for by every page; a million rows take seconds
 def channel_rows(checked: Checked) -> list[dict[str, Any]]:
     """One row for each channel: range, resolution, update, noise at rest, and what is left out."""
     noises = {each.name: each for each in checked.noises}

@@ -83,6 +83,7 @@ def check_file(
 
         return check_rows_of(path)
     columns = read_columns(path)
+    _give_back()
     suggestion = suggest_map(columns)
     used = tuple(entries) or suggestion.entries
     if not used:
@@ -95,7 +96,9 @@ def check_file(
         [] if entries else [f"no map was given; taken is what the names suggest: {suggestion.line}"]
     )
     log, streams, problem = _read_table(path, columns, used, euler, rate, notes)
-    found = check_recording(streams)
+    columns.clear()
+    _give_back()
+    found = check_recording(streams) if log is None else ()
     if log is not None:
         found = tuple(f for f in log.findings if not f.channels or set(f.channels) - log.missing)
     return replace(
@@ -104,6 +107,13 @@ def check_file(
         suggestion=suggestion,
         mapped=used,
     )
+
+
+def _give_back() -> None:
+    """Return to the system what the reader of tables keeps for the next one."""
+    import pyarrow
+
+    pyarrow.default_memory_pool().release_unused()
 
 
 def _is_episode(path: Path) -> bool:

@@ -45,6 +45,13 @@ class Fetching:
 
 def fetch(config: Fetching) -> int:
     """Download YCB meshes (CC BY 4.0) from the set's own site and cut them into outlines."""
+    from tpcd.ownership import owned
+
+    with owned(config.folder, "scripts/fetch_ycb.py"):
+        return _fetch(config)
+
+
+def _fetch(config: Fetching) -> int:
     from contextlib import suppress
 
     from tqdm import tqdm

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from tpcd.cli import run
 from tpcd.errors import CheckpointError
+from tpcd.ownership import owned
 from training.config import (
     CheckConfig,
     DataConfig,
@@ -52,8 +53,9 @@ def measure(config: Measuring) -> None:
     folder = find_prior(config.prior)
     trained, outlines = training_of(folder)
     out = config.out or Path("runs") / f"measure-{folder.name}"
-    out.mkdir(parents=True, exist_ok=True)
-    complete_card(folder, outlines, trained, out)
+    with owned(folder, "python -m training.measure"), owned(out, "python -m training.measure"):
+        out.mkdir(parents=True, exist_ok=True)
+        complete_card(folder, outlines, trained, out)
     print(f"card of {folder} renewed; figures in {out}")
 
 

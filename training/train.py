@@ -13,6 +13,7 @@ from pathlib import Path
 from tpcd.cli import run
 from tpcd.errors import RunError
 from tpcd.files import read_json
+from tpcd.ownership import owned
 from tpcd.results import CONFIG_FILE, resumed_run, run_folder, write_results
 from tpcd.targets import check_folder
 from training.config import TrainingConfig
@@ -59,7 +60,7 @@ def train_prior(config: Training) -> None:
         opened = run_folder(
             out, "python -m training.train", config, config.overwrite, resumable=CHECKPOINT
         )
-    with opened:
+    with opened, owned(export, "python -m training.train"):
         folder = train(TrainingConfig(**settings), out, export, config.resume)
         errors = read_json(folder / CARD)["training_errors_mm"]
         table = [{"error_mm": name, **values} for name, values in errors.items()]

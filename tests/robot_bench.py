@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet
+import pytest
 import torch
 
+from tpcd.errors import RobotError
 from tpcd.robot.admittance import AdmittanceSettings, at_rest
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.emulator import EmulatorSettings, emulated_frame, emulated_scene
@@ -24,11 +26,18 @@ from tpcd.robot.frames import task_frame, tcp_pose
 from tpcd.robot.link import Link, Sample
 from tpcd.robot.raw import RawRecord
 from tpcd.robot.servo import Servo
+from tpcd.robot.settling import SettlingSettings
 from tpcd.robot.ur import UniversalRobot
 
 _COUNT = itertools.count(1)
 SURFACE = 5.0
 """Yield of floor and wall [mm per 10 N]: soft, so that the arm settles soon."""
+STATED_TIME = 2.0
+"""Within which an arm is away from what it touched (tpcd/robot/README.md) [s]."""
+PRESSED = (0.1, -5e-4, 0.0)
+"""Where the arm stands when a move begins: in the floor by 1 N [m, m, rad]."""
+PRESSING = torch.tensor([0.1, -0.013, 0.0], dtype=torch.float64)
+"""A command that takes a short way further down."""
 
 
 def command(x: float, z: float, angle: float = 0.0) -> torch.Tensor:
@@ -191,6 +200,32 @@ def touching(settings: EmulatorSettings, force_x: float = 0.0, force_z: float = 
     if force_x:
         pose[0] = scene.wall_position - points[:, 0].max() + force_x * settings.compliance
     return pose
+
+
+def pressing(folder: Path, **stated: Any) -> tuple[UniversalRobot, Springy]:
+    """An arm between two moves that presses on the floor with 1 N."""
+    link = Springy(PRESSED)
+    stated = {"surface_mm_per_10n": 5.0, "retreat": 0.003, "still_time": 0.3, **stated}
+    settings = ArmSettings("springy", **stated)
+    arm = UniversalRobot(settings, folder, lambda _: True)
+    arm._link = link
+    servo = Servo(settings, link, link.frame, RawRecord(), arm._guard.signals)
+    servo.state = at_rest(np.array(PRESSED), np.array([0.0, 1.0, 0.0]))
+    servo.settling = SettlingSettings(window=0.08)
+    servo._command = np.array(PRESSED) - (0.0, 0.01, 0.0)
+    arm._guard.servo = servo
+    return arm, link
+
+
+def check_rest(arm: UniversalRobot, link: Springy, force: float) -> None:
+    """The arm is locked, nothing moves it, and it presses no more than before."""
+    sent, target = link.sent, link.target
+    assert arm.at_rest is not None
+    with pytest.raises(RobotError, match="connect anew"):
+        arm.settle(command(0.1, 0.0))
+    arm.stop()
+    assert link.sent == sent and link.target is target
+    assert link.force <= force + 1e-9
 
 
 def wired_servo(law: AdmittanceSettings | None = None, **changed: Any) -> tuple[Servo, Controller]:

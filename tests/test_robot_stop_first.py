@@ -1,24 +1,32 @@
-"""Whatever fails in a move, the arm comes to rest first: every call, every line, a full disk."""
+"""Whatever fails in a move, the arm comes to rest first: every call, a full disk, what is between.
+
+Ctrl-C is in test_robot_interrupts.py.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
-import signal
-import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet
 import pytest
 import torch
-from robot_bench import Springy, command, raw_of, wired_arm
+from robot_bench import (
+    PRESSED,
+    PRESSING,
+    STATED_TIME,
+    Springy,
+    check_rest,
+    command,
+    pressing,
+    raw_of,
+    wired_arm,
+)
 
 import tpcd.files
 from tpcd.belief.paper import PaperSettings
@@ -27,43 +35,19 @@ from tpcd.data.episode import Episode
 from tpcd.errors import RobotError
 from tpcd.exploration import Estimator, explore
 from tpcd.policies.protocol import Choice, Situation
-from tpcd.robot import guard, held_signals, raw, ur
-from tpcd.robot import link as link_module
 from tpcd.robot import servo as servo_module
-from tpcd.robot.admittance import at_rest
-from tpcd.robot.arm_settings import ArmSettings
-from tpcd.robot.held_signals import HeldSignals, kill_as_ctrl_c
 from tpcd.robot.protocol import stopped_first
 from tpcd.robot.raw import RawRecord
-from tpcd.robot.servo import Servo
-from tpcd.robot.settling import SettlingSettings
 from tpcd.robot.ur import UniversalRobot
 from tpcd.shape.checkpoint import load_prior
 
-TRACED = [module.__file__ for module in (guard, held_signals, link_module, raw, servo_module, ur)]
-"""What these call is arithmetic, a part of their lines."""
-STATED_TIME = 2.0
-"""Within which an arm is away from what it touched (tpcd/robot/README.md) [s]."""
-PRESSED = (0.1, -5e-4, 0.0)
-"""Where the arm stands when a move begins: in the floor by 1 N [m, m, rad]."""
-PRESSING = command(0.1, -0.013)
-"""A command that takes a short way further down."""
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
-def pressing(folder: Path, **stated: Any) -> tuple[UniversalRobot, Springy]:
-    """An arm between two moves that presses on the floor with 1 N."""
-    link = Springy(PRESSED)
-    stated = {"surface_mm_per_10n": 5.0, "retreat": 0.003, "still_time": 0.3, **stated}
-    settings = ArmSettings("springy", **stated)
-    arm = UniversalRobot(settings, folder, lambda _: True)
-    arm._link = link
-    servo = Servo(settings, link, link.frame, RawRecord(), arm._guard.signals)
-    servo.state = at_rest(np.array(PRESSED), np.array([0.0, 1.0, 0.0]))
-    servo.settling = SettlingSettings(window=0.08)
-    servo._command = np.array(PRESSED) - (0.0, 0.01, 0.0)
-    arm._guard.servo = servo
-    return arm, link
+@pytest.fixture(autouse=True)
+def arriving_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arm here is where it is sent: nothing to wait for at the end of a ramp."""
+    monkeypatch.setattr(servo_module, "ARRIVING", 0.03)
 
 
 class Counted:
@@ -100,17 +84,6 @@ def counting(link: Springy, arm: UniversalRobot, counted: Counted) -> Iterator[N
         ):  # fmt: skip
             patch.setattr(owner, name, counted.around(getattr(owner, name), name, link))
         yield
-
-
-def check_rest(arm: UniversalRobot, link: Springy, force: float) -> None:
-    """The arm is locked, nothing moves it, and it presses no more than before."""
-    sent, target = link.sent, link.target
-    assert arm.at_rest is not None
-    with pytest.raises(RobotError, match="connect anew"):
-        arm.settle(command(0.1, 0.0))
-    arm.stop()
-    assert link.sent == sent and link.target is target
-    assert link.force <= force + 1e-9
 
 
 def errors() -> list[BaseException]:
@@ -227,202 +200,6 @@ def test_a_second_failure_in_the_retreat_leaves_the_arm_standing_and_both_told(
         with pytest.raises(RobotError, match="beyond the limit of 6 N; the arm holds its place"):
             arm.settle(command(0.1, -0.08))
         check_rest(arm, link, 9.0)
-
-
-def lines_of(call: Callable[[], object], act: Callable[[tuple[str, int], int], None]) -> None:
-    """Run a call; `act` is told of every line that is traced, and how often it came."""
-    seen: dict[tuple[str, int], int] = {}
-
-    def trace(frame: FrameType, event: str, _: object) -> Any:
-        if frame.f_code.co_filename not in TRACED:
-            return None
-        if event == "line":
-            place = (frame.f_code.co_filename, frame.f_lineno)
-            seen[place] = seen.get(place, 0) + 1
-            act(place, seen[place])
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        call()
-    finally:
-        sys.settrace(before)
-
-
-@pytest.fixture(autouse=True)
-def arriving_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The arm here is where it is sent: nothing to wait for at the end of a ramp."""
-    monkeypatch.setattr(servo_module, "ARRIVING", 0.03)
-
-
-@pytest.fixture
-def ctrl_c() -> Iterator[None]:
-    """Ctrl-C as in a terminal: what runs in the background has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.parametrize("how", ["signal", "raised"])
-def test_ctrl_c_at_every_line_of_a_move_ends_with_the_arm_at_rest(
-    how: str, tmp_path: Path, ctrl_c: None
-) -> None:
-    """As a signal, the first time that each line is run, it waits for the next reading. Raised on
-    the spot, the last time, it may also strike what would bring the arm to rest: then it stands,
-    is locked, and is seen to by whoever lets go of it."""
-    times: dict[tuple[str, int], int] = {}
-    arm, _ = pressing(tmp_path)
-    lines_of(lambda: arm.settle(PRESSING), lambda at, n: times.update({at: n}))
-    moments = [(at, 1 if how == "signal" else last) for at, last in times.items()]
-    assert len(moments) > 100
-    struck = 0
-    for place, count in moments:
-        arm, link = pressing(tmp_path / "again")
-        done = []
-
-        def strike(at: tuple[str, int], n: int) -> None:
-            if not done and at == place and n == count:  # noqa: B023
-                done.append(link.time)  # noqa: B023
-                sys.settrace(None)
-                if how == "signal":
-                    signal.raise_signal(signal.SIGINT)
-                else:
-                    raise KeyboardInterrupt
-
-        with suppress(KeyboardInterrupt):
-            lines_of(lambda: arm.settle(PRESSING), strike)  # noqa: B023
-            raise AssertionError(f"{place} went on")
-        struck += 1
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler or how == "raised"
-        assert link.time - done[0] < STATED_TIME
-        if link.sent == 0:  # The move had not begun.
-            assert link.force <= 1.0 + 1e-9
-            continue
-        assert arm.at_rest is not None, place
-        if how == "raised":
-            arm.stop()
-        check_rest(arm, link, 0.0)
-    assert struck == len(moments)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_a_second_ctrl_c_ends_the_retreat_and_the_arm_stands(tmp_path: Path, ctrl_c: None) -> None:
-    arm, link = pressing(tmp_path)
-    read, retreating = link.next_sample, []
-
-    def interrupted() -> Any:
-        if link.sent == 10:
-            signal.raise_signal(signal.SIGINT)
-        if arm._guard.servo is not None and arm._guard.servo._retreating:
-            retreating.append(link.time)
-            if len(retreating) == 5:
-                signal.raise_signal(signal.SIGINT)
-        return read()
-
-    link.next_sample = interrupted  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt, match="holds its place, its way back"):
-        arm.settle(command(0.1, -0.05))
-    assert len(retreating) < 8
-    check_rest(arm, link, 2.0)
-
-
-def test_ctrl_c_in_the_retreat_after_the_last_move_is_raised_once_the_arm_stands(
-    tmp_path: Path, ctrl_c: None
-) -> None:
-    arm, link = pressing(tmp_path)
-    read = link.next_sample
-
-    def interrupted() -> Any:
-        if link.sent == 3:
-            signal.raise_signal(signal.SIGINT)
-        return read()
-
-    link.next_sample = interrupted  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt):
-        arm.stop()
-    assert (arm.at_rest or "").startswith("the arm holds its place")
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_a_handler_of_the_user_is_called_and_the_move_goes_on_if_it_returns(tmp_path: Path) -> None:
-    heard: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
-    try:
-        arm, link = pressing(tmp_path)
-        read = link.next_sample
-
-        def interrupted() -> Any:
-            if link.sent == 3 and not heard:
-                signal.raise_signal(signal.SIGINT)
-            return read()
-
-        link.next_sample = interrupted  # type: ignore[method-assign]
-        assert arm.settle(PRESSING).settled
-        assert heard == [signal.SIGINT]
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def test_a_kill_in_a_move_is_as_ctrl_c_and_only_meanwhile(tmp_path: Path) -> None:
-    arm, link = pressing(tmp_path)
-    read = link.next_sample
-
-    def killed() -> Any:
-        if link.sent == 3:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return read()
-
-    link.next_sample = killed  # type: ignore[method-assign]
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    try:
-        with kill_as_ctrl_c(), pytest.raises(KeyboardInterrupt, match="has retreated|holds"):
-            arm.settle(PRESSING)
-        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    check_rest(arm, link, 1.5)
-
-
-def test_signals_are_held_in_the_main_thread_alone(ctrl_c: None) -> None:
-    found: list[object] = []
-
-    def elsewhere() -> None:
-        signals = HeldSignals()
-        signals.hold()
-        found.append(signal.getsignal(signal.SIGINT))
-        signals.release()
-
-    thread = threading.Thread(target=elsewhere)
-    thread.start()
-    thread.join()
-    assert found == [signal.default_int_handler]
-
-
-def test_stopping_from_another_thread_ends_the_move_there(tmp_path: Path) -> None:
-    arm, link = pressing(tmp_path)
-    read, raised = link.next_sample, []
-
-    def slow() -> Any:
-        time.sleep(1e-3)
-        return read()
-
-    link.next_sample = slow  # type: ignore[method-assign]
-
-    def move() -> None:
-        try:
-            arm.settle(command(0.1, -0.05))
-        except RobotError as error:
-            raised.append(str(error))
-
-    thread = threading.Thread(target=move)
-    thread.start()
-    while link.sent < 10:
-        time.sleep(1e-3)
-    arm.stop()
-    thread.join()
-    assert "told to stop; the arm has retreated" in raised[0]
-    check_rest(arm, link, 0.0)
 
 
 def test_letting_go_of_an_arm_leaves_what_it_pressed_on(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tpcd.quality.finding import Finding, Weight
-from tpcd.quality.habit import grid_step
 
 POSES = ("x", "z", "phi")
 WRENCHES = ("F_x", "F_z", "tau")
@@ -53,7 +52,7 @@ def check_repeats(
         allowed = noise
         if not wrenches[first].any():
             allowed = np.maximum(noise, NOTABLE * np.abs(expected).max(0))
-        if (changes > allowed).any():
+        if (changes > allowed).any() and not _free(wrenches, first, end):
             axis = int(np.argmax(changes / allowed))
             told[first:end] = True
             found.append(_frozen(WRENCHES, wrenches[first], first, end, changes[axis], axis))
@@ -64,15 +63,15 @@ def check_repeats(
             axis = int(np.argmax(left / noise))
             found.append(_frozen(POSES, poses[first], first, end, left[axis], axis))
     for axis in range(3):
-        column, step = wrenches[:, axis], grid_step(wrenches[:, axis])
+        column, step = wrenches[:, axis], _resolution(wrenches[:, axis])
         limit = noise[axis] + step
         ends = _at_end(column, expected[:, axis], noise[axis] - LEAST[axis], LEAST[axis] + step)
         found += [_clipped(axis, value, rows) for value, rows in ends]
         for first, end in _runs(column[1:] == column[:-1]):
             change = float(np.ptp(expected[first:end, axis]))
             at_end = any(column[first] == value for value, _ in ends)
-            free = not wrenches[first:end].any() or told[first:end].all()
-            if end - first >= FEWEST and change > limit and not at_end and not free:
+            known = told[first:end].all() or _free(column[:, None], first, end)
+            if end - first >= FEWEST and change > limit and not at_end and not known:
                 names = (WRENCHES[axis],)
                 found.append(_frozen(names, column[first : first + 1], first, end, change, axis))
     return tuple(found)
@@ -83,6 +82,24 @@ def _runs(same: Bool[np.ndarray, " m"]) -> Iterator[tuple[int, int]]:
     edges = np.flatnonzero(np.diff(np.concatenate(([0], same.astype(np.int8), [0]))))
     for first, end in edges.reshape(-1, 2):
         yield int(first), int(end) + 1
+
+
+def _free(readings: Float[np.ndarray, "n w"], first: int, end: int) -> bool:
+    """Whether rows with one reading are rather those in free space of a sensor without noise.
+
+    Such a reading comes again elsewhere, and it is that of the free start, unless the sensor read
+    nothing else in most of the rows. A frozen sensor gives a number that it gave never before.
+    """
+    same = (readings == readings[first]).all(1)
+    if 2 * (end - first) > len(readings):
+        return False
+    return first == 0 or int(same.sum()) > end - first
+
+
+def _resolution(column: Float[np.ndarray, " n"]) -> float:
+    """The smallest step between readings; 0 where all are equal."""
+    gaps = np.diff(np.unique(column))
+    return float(gaps.min()) if len(gaps) else 0.0
 
 
 def _at_end(

@@ -60,6 +60,7 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
     from tpcd.data.checks import check_units
+    from tpcd.data.doubts import doubts_told
     from tpcd.errors import EpisodeError, RunError
     from tpcd.exploration import Estimator
     from tpcd.results import (
@@ -114,7 +115,13 @@ def estimate_episode(config: Estimate) -> None:
         # The paper's filter does not know that the start is free.
         paper = config.estimator == "paper"
         contradicted = "" if paper else contradicted_start(episode, belief)
-        write_results(folder, table, seeds=[config.seed], contradicted=contradicted)
+        write_results(
+            folder,
+            table,
+            seeds=[config.seed],
+            contradicted=contradicted,
+            episode_doubts=doubts_told(episode.doubts, episode.path) or "",
+        )
     if contradicted:
         raise EpisodeError(config.episode, contradicted, f"what was found is in {config.out}")
     print(

@@ -187,12 +187,20 @@ def _robot_line(config: Planning, out: Path, plan: Sequence[Planned]) -> str:
 
 
 def _complete(config: Planning) -> None:
+    import sys
+
     from tpcd.data import read_episode
+    from tpcd.data.doubts import doubts_told
     from tpcd.discrepancy.coverage import MOTIONS, coverage_of
     from tpcd.effects import CATALOGUE
     from tpcd.results import format_table
 
-    coverage = coverage_of([read_episode(path) for path in config.after])
+    episodes = [read_episode(path) for path in config.after]
+    for episode in episodes:
+        told = doubts_told(episode.doubts, episode.path)
+        if told:
+            print(f"warning: {told}", file=sys.stderr)
+    coverage = coverage_of(episodes)
     lacks = {effect.name: coverage.missing(effect.needs) for effect in CATALOGUE}
     rows = []
     for need, motion in MOTIONS.items():

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tpcd.commands.checked import Checked
-from tpcd.data.checks import FREE_OF_NOISE, check_episode, repeated_readings
+from tpcd.data.checks import episode_findings
 from tpcd.data.episode import COLUMNS, Episode
 from tpcd.data.files import read_episode
 from tpcd.data.noise import check_noise
@@ -23,14 +23,11 @@ from tpcd.quality.stream import Stream
 def check_rows_of(path: Path) -> Checked:
     """Read and check an episode; raises `EpisodeError` for one that breaks the format."""
     episode = read_episode(path)
-    repeats = repeated_readings(episode)
-    told = {str(each) for each in repeats}
-    doubts = [sentence for sentence in check_episode(episode) if sentence not in told]
+    findings = [*episode.doubts, *episode_findings(episode)]
     try:
-        doubts += check_noise(episode)
+        findings += [Finding("row", Weight.DOUBT, line) for line in check_noise(episode)]
     except EpisodeError as error:
-        doubts.append(error.problem)
-    findings = (*repeats, *(Finding("row", _weight(each), each) for each in doubts))
+        findings.append(Finding("row", Weight.DOUBT, error.problem, remedy=error.remedy))
     stream = _rows_stream(episode)
     table = dict(zip(stream.channels, stream.values.T, strict=True)) | {"time": stream.times}
     log = log_from_columns(
@@ -39,12 +36,8 @@ def check_rows_of(path: Path) -> Checked:
         episode.path or path,
     )
     quantities = identify(replace(log, findings=()), tuple(episode.stiffness.tolist()))
-    return Checked(episode.path or path, "episode", (stream,), findings, quantities=quantities)
-
-
-def _weight(sentence: str) -> Weight:
-    """What is said of an episode without noise, as a simulated one is, is no doubt."""
-    return Weight.NOTE if sentence.endswith(FREE_OF_NOISE) else Weight.DOUBT
+    found = tuple(findings)
+    return Checked(episode.path or path, "episode", (stream,), found, quantities=quantities)
 
 
 def _rows_stream(episode: Episode) -> Stream:

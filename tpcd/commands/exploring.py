@@ -19,6 +19,7 @@ from tpcd.commands.exploration_run import Kept, Stopping, run_exploration
 from tpcd.commands.exploring_options import ExploringOptions
 from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
 from tpcd.commands.summary import parameter_rows
+from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
 from tpcd.data.files import read_episode, write_together
 from tpcd.errors import RobotError
@@ -167,4 +168,7 @@ def _kept(folder: Path, estimator: Estimator, prior: str) -> Kept:
 
 def _task(path: Path) -> Task:
     episode = read_episode(path)
+    told = doubts_told(episode.doubts, episode.path)
+    if told:
+        print(f"warning: {told}", file=sys.stderr)
     return Task(episode.poses[:-1], episode.commands[1:], episode.commands[:-1])

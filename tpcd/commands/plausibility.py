@@ -15,7 +15,8 @@ from tpcd.belief.prior import make_prior
 from tpcd.commands.estimation import STEPS_FILE, SUMMARY_FILE
 from tpcd.commands.unexplained import unexplained_warning
 from tpcd.contact import scene_from_parameters, terrain_gaps
-from tpcd.data.checks import NO_CONTACT, check_episode
+from tpcd.data.checks import NO_CONTACT, episode_findings
+from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
 from tpcd.data.table import row_name
 from tpcd.effects.shape_change import ShapeChange
@@ -121,8 +122,10 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
     if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
         found.append(f"{run} was stopped before its last row; its belief is of the rows so far")
     if (run / RESULTS_FILE).is_file():
-        contradicted = read_json(run / RESULTS_FILE).get("contradicted")
+        results = read_json(run / RESULTS_FILE)
+        contradicted, doubts = results.get("contradicted"), results.get("episode_doubts")
         found += [f"{run} was learnt from {contradicted}"] if contradicted else []
+        found += [f"{run} was learnt from an episode with doubts: {doubts}"] if doubts else []
     if (run / SUMMARY_FILE).is_file():
         summary = read_json(run / SUMMARY_FILE)
         unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))
@@ -132,7 +135,10 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
         found += [f"{run}: {unknown}"] if unknown else []
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "
-        found += [name + each for each in check_episode(episode) if each != NO_CONTACT]
+        told = doubts_told(episode.doubts, episode.path)
+        found += [told] if told else []
+        found += [f"{name}{each}" for each in map(str, episode_findings(episode))
+                  if each != NO_CONTACT]  # fmt: skip
     return found
 
 

@@ -13,24 +13,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tpcd.data.header import LARGEST_LENGTH, SENSOR_NAMES
+from tpcd.data.doubts import doubts_told
+from tpcd.data.header import SENSOR_NAMES
+from tpcd.data.limits import (
+    COMMAND_COLUMNS,
+    POSE_COLUMNS,
+    WRENCH_COLUMNS,
+    check_columns,
+    check_jumps,
+)
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 from tpcd.quality.episode_rows import check_repeats
-from tpcd.quality.finding import Finding
+from tpcd.quality.finding import Finding, Weight
+from tpcd.quality.lever import depth_of_contact
 
 if TYPE_CHECKING:
     from tpcd.data.episode import Episode
 
-COMMAND_COLUMNS = ("u_x", "u_z", "u_phi")
-POSE_COLUMNS = ("x", "z", "phi")
-WRENCH_COLUMNS = ("F_x", "F_z", "tau")
-LARGEST_JUMP = 0.5
-"""Commands, or poses, of neighbouring rows further apart than this [m] are taken for an error."""
-LARGEST_TURN = 2.0
-"""The same of their angles [rad]."""
-LARGEST_WRENCH = 1e4
-"""Forces and torques beyond this [N, N·m] are taken for millinewtons or a fault."""
 NOISE_FACTOR = 6.0
 """Differences beyond this many standard deviations are not noise (1 in 5e8 for a normal)."""
 ROUNDING = 1e-6
@@ -43,6 +43,10 @@ ANOTHER_ORDER = 5.0
 """Forces that are larger or smaller than K (pose - command) by this factor are in other units."""
 LEAST_FELT = 2
 """So many rows beyond the noise are no bad reading any more."""
+UNIT_LEFT = 0.5
+"""Forces are in another unit where that leaves less than this part of them."""
+SIDE = 5.0
+"""Standard errors from which on it is known from which side forces act (see `lever`)."""
 LEAST_ROWS = 3
 """Rows beyond the noise that tell in which units an episode is."""
 FREE_WRENCH = 1e-3
@@ -80,45 +84,16 @@ def check_rows(
     poses: np.ndarray,
     wrenches: np.ndarray,
     sensor_std: np.ndarray,
+    stiffness: np.ndarray,
+    unusual: bool = False,
 ) -> None:
     """Refuse rows (n, 3) that are not finite, not SI, jump, or do not start at rest and free.
 
     Raises `EpisodeError` naming row and column.
     """
-    length, angle = (LARGEST_LENGTH, "m", "millimetres"), (2 * math.pi, "rad", "degrees")
-    force, torque = (LARGEST_WRENCH, "N", "millinewtons"), (LARGEST_WRENCH, "N·m", "mN·m")
-    columns = (
-        (COMMAND_COLUMNS, commands, (length, length, angle)),
-        (POSE_COLUMNS, poses, (length, length, angle)),
-        (WRENCH_COLUMNS, wrenches, (force, force, torque)),
-    )
-    for names, values, limits in columns:
-        for axis, name in enumerate(names):
-            _check_column(path, name, values[:, axis], limits[axis])
-    _check_jumps(path, "command", COMMAND_COLUMNS, commands)
-    _check_jumps(path, "pose", POSE_COLUMNS, poses)
+    check_columns(path, commands, poses, wrenches, unusual)
+    check_jumps(path, commands, poses, wrenches, stiffness)
     _check_start(path, commands[0], poses[0], wrenches[0], sensor_std)
-
-
-def _check_jumps(path: Path, what: str, names: tuple[str, ...], values: np.ndarray) -> None:
-    steps = np.diff(values, axis=0)
-    turns = np.abs(np.remainder(steps[:, 2] + math.pi, 2 * math.pi) - math.pi)
-    position, angle = f"columns {names[0]}, {names[1]}", f"column {names[2]}"
-    lengths = np.linalg.norm(steps[:, :2], axis=1)
-    frame, unit_of_angle = f"check the frame of the {what}s", f"check that {names[2]} is in rad"
-    for columns, verb, sizes, largest, unit, remedy in (
-        (position, "jumps", lengths, LARGEST_JUMP, "m", frame),
-        (angle, "turns", turns, LARGEST_TURN, "rad", unit_of_angle),
-    ):
-        if not len(sizes) or sizes.max() <= largest:
-            continue
-        row = int(np.argmax(sizes > largest)) + 1
-        raise EpisodeError(
-            path,
-            f"{row_name(row, path)}, {columns}: the {what} {verb} by {sizes[row - 1]:.3g} {unit},"
-            f" expected at most {largest:g} {unit}",
-            f"{remedy}, or split the episode there",
-        )
 
 
 def _check_start(
@@ -152,60 +127,65 @@ def _check_start(
         )
 
 
-def _check_column(path: Path, name: str, column: np.ndarray, limit: tuple[float, str, str]) -> None:
-    finite = np.isfinite(column)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise EpisodeError(
-            path,
-            f"{row_name(row, path)}, column {name}: found {column[row]}, expected a finite number",
-            "measure the step again, or split the episode there",
-        )
-    largest, unit, likely = limit
-    if len(column) and np.abs(column).max() > largest:
-        row = int(np.argmax(np.abs(column) > largest))
-        raise EpisodeError(
-            path,
-            f"{row_name(row, path)}, column {name}: found {column[row]:g}, expected {unit}"
-            f" (at most {largest:.3g}); it looks like {likely}",
-            f"convert the column to {unit}",
-        )
-
-
 def check_episode(episode: Episode) -> list[str]:
     """Sentences on what is suspicious in an episode that obeys the format; often none.
+
+    What it was accepted in spite of comes first, in one line.
+    """
+    told = doubts_told(episode.doubts, episode.path)
+    return [*([told] if told else []), *(str(each) for each in episode_findings(episode))]
+
+
+def episode_findings(episode: Episode) -> list[Finding]:
+    """What speaks against the rows of an episode that obeys the format.
 
     In equilibrium the wrench is K (pose - command); rows whose wrench has the opposite
     sign or another size speak for a sign or unit error of the sensor or of the stiffness.
     """
-    warnings = []
+    found = []
     noise, largest_wrench = episode.sensor_std.numpy(), np.abs(episode.wrenches.numpy()).max(0)
     significant, felt = _beyond_noise(episode)
-    for axis, (name, slope) in enumerate(wrench_slopes(episode).items()):
+    unit = _unit_of_forces(episode)
+    if unit is not None:
+        found.append(_serious("unit", *unit))
+    slopes = wrench_slopes(episode)
+    for axis, (name, slope) in enumerate(slopes.items()):
+        if unit is not None and name != "tau":
+            continue
         if slope is None:
             if felt[:, axis].sum() >= LEAST_FELT:
-                largest = largest_wrench[axis]
-                warnings.append(
-                    f"{name} reaches {largest:.3g} while K (pose - command) stays within the noise;"
-                    " check the stiffness and the units"
+                told = (
+                    f"{name} reaches {largest_wrench[axis]:.3g} while K (pose - command) stays"
+                    " within the noise; check the stiffness and the units"
                 )
+                found.append(Finding("wrench", Weight.DOUBT, told))
             continue
-        if slope < INVERTED:
-            warnings.append(inverted_sentence(name, slope))
+        if name == "tau" and slope < INVERTED and _right_forces(slopes):
+            found.append(_serious("inverted", *turned_told(episode, slope)))
+        elif slope < INVERTED:
+            found.append(
+                _serious("inverted", inverted_sentence(name, slope), inverted_remedy(name))
+            )
         elif name == "tau" and _as_in_degrees(slope):
-            warnings.append("; ".join(degrees_told(slope)))
+            found.append(_serious("unit", *degrees_told(slope)))
         elif not 0.5 < slope < 2.0:
-            warnings.append(
+            told = (
                 f"{name} is {slope:.2g} times K (pose - command), expected about 1; check the"
                 " stiffness, the units and whether the arm had settled"
             )
+            found.append(Finding("wrench", Weight.DOUBT, told))
     if not significant.any() and not (felt.sum(0) >= LEAST_FELT).any():
-        warnings.append(NO_CONTACT)
-    warnings += map(str, repeated_readings(episode))
+        found.append(Finding("contact", Weight.DOUBT, NO_CONTACT))
+    found += repeated_readings(episode)
     silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
     if silent:
-        warnings.append(f"sensor_std of {', '.join(silent)} is 0: {FREE_OF_NOISE}")
-    return warnings
+        told = f"sensor_std of {', '.join(silent)} is 0: {FREE_OF_NOISE}"
+        found.append(Finding("noise", Weight.NOTE, told))
+    return found
+
+
+def _serious(kind: str, sentence: str, remedy: str) -> Finding:
+    return Finding(kind, Weight.SERIOUS, sentence, remedy=remedy)
 
 
 def repeated_readings(episode: Episode) -> tuple[Finding, ...]:
@@ -226,6 +206,7 @@ def check_units(episode: Episode) -> None:
     angles are in degrees, in every way to measure it (`wrench_ratios`). Raises `EpisodeError`.
     """
     where = episode.path or "episode"
+    check_scale(episode)
     for name, ratios in wrench_ratios(episode).items():
         if name == "tau":
             if all(map(_as_in_degrees, ratios)):
@@ -235,6 +216,14 @@ def check_units(episode: Episode) -> None:
         elif min(map(abs, ratios)) > ANOTHER_ORDER or ANOTHER_ORDER * max(map(abs, ratios)) < 1:
             told = f"{name} is {ratios[0]:.2g} times K (pose - command), expected about 1"
             raise EpisodeError(where, told, "check the stiffness and the units")
+
+
+def check_scale(episode: Episode) -> None:
+    """Refuse an episode whose forces are K (pose - command) but for a factor of 1000; raises
+    `EpisodeError` with the unit that makes it."""
+    unit = _unit_of_forces(episode)
+    if unit is not None:
+        raise EpisodeError(episode.path or "episode", *unit)
 
 
 def wrench_ratios(episode: Episode) -> dict[str, tuple[float, ...]]:
@@ -260,6 +249,56 @@ def wrench_ratios(episode: Episode) -> dict[str, tuple[float, ...]]:
             ways = (slope, beside[axis, axis], np.median(there / here), size)
             found[name] = tuple(map(float, ways))
     return found
+
+
+def _unit_of_forces(episode: Episode) -> tuple[str, str] | None:
+    """What is said of forces that are K (pose - command) but for a factor of 1000, and what to do;
+    None where they are not."""
+    forces, expected = episode.wrenches.numpy()[:, :2], _expected_wrenches(episode)[:, :2]
+    limit = NOISE_FACTOR * episode.sensor_std.numpy()[3:5] + FREE_WRENCH
+    rows = (np.abs(forces) > limit).any(1)
+    if rows.sum() < LEAST_ROWS:
+        return None
+    forces, expected = forces[rows], expected[rows]
+    size = np.linalg.norm(forces)
+    if np.linalg.norm(forces - expected) < UNIT_LEFT * size:
+        return None
+    for factor, told, remedy in (
+        (1e-3, "as where positions are in millimetres",
+         "expected about 1; check the stiffness, or convert u_x, u_z, x and z to m"),
+        (1e3, "as where the stiffness is in N/mm, or forces are in millinewtons",
+         "expected about 1; give the stiffness in N/m and forces in N"),
+    ):  # fmt: skip
+        if np.linalg.norm(forces - factor * expected) < UNIT_LEFT * size:
+            return f"forces are {factor:g} times K (pose - command), {told}", remedy
+    return None
+
+
+def _right_forces(slopes: dict[str, float | None]) -> bool:
+    """Whether all forces that show anything have the right sign."""
+    told = [slope for name, slope in slopes.items() if name != "tau" and slope is not None]
+    return bool(told) and min(told) > 0
+
+
+def turned_told(episode: Episode, slope: float) -> tuple[str, str]:
+    """What is said of a torque that is inverted where forces are right: either it or the angle
+    turns the other way, and from which side forces act may tell which."""
+    wrenches = episode.wrenches.numpy()
+    depth, error = depth_of_contact(
+        wrenches, episode.poses.numpy()[:, 2], float(episode.sensor_std[5])
+    )
+    told = (
+        f"tau is {slope:.2f} times K (phi - u_phi) while forces have the right sign, so either the"
+        " angle or the torque looks inverted"
+    )
+    angle, torque = "change the sign of u_phi and phi", "change the sign of tau"
+    if abs(depth) > SIDE * error:
+        first, side = (torque, "within") if depth < 0 else (angle, "outside")
+        told += f"; with tau as it is, forces act from {side} the object"
+        return told, f"{first}, if phi does{'' if depth < 0 else ' not'} grow from x to z"
+    return told, (
+        f"look whether phi grows as the hand turns from x to z: if not, {angle}; else {torque}"
+    )
 
 
 def _as_in_degrees(ratio: float) -> bool:

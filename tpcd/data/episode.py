@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.contract import as_numbers, check_pose, check_stiffness
-from tpcd.data.checks import COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS
+from tpcd.data.limits import COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS
+from tpcd.quality.finding import Finding
 
 COLUMNS = ("step", *COMMAND_COLUMNS, *POSE_COLUMNS, *WRENCH_COLUMNS)
 
@@ -45,6 +46,8 @@ class Episode:
     """Uniform priors (low, high) for entries of theta; what is missing takes the defaults."""
     extra: dict[str, np.ndarray] = field(default_factory=dict)
     """Further columns of the table, each of length n."""
+    doubts: tuple[Finding, ...] = ()
+    """What it was accepted in spite of; part of its YAML."""
     path: Path | None = None
     """The table the episode was read from."""
     unusual: bool = False

@@ -16,15 +16,10 @@ import numpy as np
 import torch
 import yaml
 
-from tpcd.data.checks import (
-    COMMAND_COLUMNS,
-    POSE_COLUMNS,
-    WRENCH_COLUMNS,
-    check_rows,
-    check_steps,
-)
+from tpcd.data.checks import check_rows, check_steps
 from tpcd.data.episode import COLUMNS, Episode
 from tpcd.data.header import ESTIMATE_NOISE, Header, encode_header, parse_header, read_header
+from tpcd.data.limits import COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS
 from tpcd.data.measured import NoCommandsError
 from tpcd.data.table import Table, encode_table, read_table
 from tpcd.errors import EpisodeError
@@ -60,7 +55,8 @@ def read_rows(table_path: Path, header: Header) -> Episode:
         np.stack([table[name] for name in names], axis=1)
         for names in (COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS)
     )
-    check_rows(table_path, commands, poses, wrenches, np.array(header.sensor_std))
+    std, stiffness = np.array(header.sensor_std), np.array(header.stiffness)
+    check_rows(table_path, commands, poses, wrenches, std, stiffness, header.unusual)
     return Episode(
         commands=torch.from_numpy(commands),
         poses=torch.from_numpy(poses),
@@ -72,6 +68,7 @@ def read_rows(table_path: Path, header: Header) -> Episode:
         time_step_s=header.time_step_s,
         priors=header.priors,
         extra={name: column for name, column in table.items() if name not in COLUMNS},
+        doubts=header.doubts,
         path=table_path,
         unusual=header.unusual,
     )
@@ -114,6 +111,7 @@ def episode_contents(
         time_step_s=episode.time_step_s,
         priors=dict(episode.priors),
         unusual=episode.unusual,
+        doubts=episode.doubts,
     )
     header_bytes = encode_header(header)
     parse_header(yaml.safe_load(header_bytes), header_path)
@@ -122,7 +120,8 @@ def episode_contents(
     )
     table: Table = {"step": np.arange(len(episode), dtype=np.int64)}
     check_steps(table_path, table["step"])
-    check_rows(table_path, commands, poses, wrenches, episode.sensor_std.numpy())
+    std, stiffness = episode.sensor_std.numpy(), episode.stiffness.numpy()
+    check_rows(table_path, commands, poses, wrenches, std, stiffness, episode.unusual)
     for names, values in (
         (COMMAND_COLUMNS, commands),
         (POSE_COLUMNS, poses),

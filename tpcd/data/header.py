@@ -2,9 +2,9 @@
 
 Keys: `stiffness` [N/m, N/m, N·m/rad] is required, and so is `sensor_std` (x, z [m], phi [rad],
 F_x, F_z [N], tau [N·m]) but for a diagnosis, which can estimate it; `object`, `notes`,
-`time_step_s` [s] and `priors` (name of a scene parameter to [low, high], SI) are optional, and
-`commands: unknown` marks a recording without set points (see `measured`); anything else is
-refused with a hint.
+`time_step_s` [s], `priors` (name of a scene parameter to [low, high], SI) and `doubts` (see
+`doubts`) are optional, and `commands: unknown` marks a recording without set points (see
+`measured`); anything else is refused with a hint.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ import torch
 import yaml
 
 from tpcd.contract import LARGEST_LENGTH, check_stiffness
+from tpcd.data.doubts import encode_doubts, parse_doubts
 from tpcd.errors import EpisodeError
 from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
+from tpcd.quality.finding import Finding
 
 KEYS = (
     *("stiffness", "sensor_std", "object", "notes", "time_step_s", "priors", "commands"),
-    "unusual",
+    *("unusual", "doubts"),
 )
 SENSOR_NAMES = ("x", "z", "phi", "F_x", "F_z", "tau")
 ESTIMATE_NOISE = (
@@ -50,7 +52,9 @@ class Header:
     commands_known: bool = True
     """False where the set points were not recorded."""
     unusual: bool = False
-    """Whether a stiffness that looks like another unit is meant so."""
+    """Whether numbers that look like another unit are meant so."""
+    doubts: tuple[Finding, ...] = ()
+    """What it was accepted in spite of."""
 
 
 def read_header(path: Path) -> Header:
@@ -129,9 +133,10 @@ def parse_header(content: Any, path: Path) -> Header:
         object=_text(path, "object", content.get("object")),
         notes=_text(path, "notes", content.get("notes")),
         time_step_s=time_step,
-        priors=_priors(path, content.get("priors")),
+        priors=_priors(path, content.get("priors"), unusual),
         commands_known=commands == "known",
         unusual=unusual,
+        doubts=parse_doubts(path, content.get("doubts")),
     )
 
 
@@ -151,6 +156,8 @@ def encode_header(header: Header) -> bytes:
         content["priors"] = {
             name: [float(low), float(high)] for name, (low, high) in header.priors.items()
         }
+    if header.doubts:
+        content["doubts"] = encode_doubts(header.doubts)
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     return text.encode("utf-8")
 
@@ -175,7 +182,7 @@ def _sensor_std(path: Path, value: Any) -> tuple[float, ...]:
     return tuple(sensor_std)
 
 
-def _priors(path: Path, content: Any) -> dict[str, tuple[float, float]]:
+def _priors(path: Path, content: Any, unusual: bool) -> dict[str, tuple[float, float]]:
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -196,7 +203,7 @@ def _priors(path: Path, content: Any) -> dict[str, tuple[float, float]]:
                 "swap them, or give a narrow range around a known value",
             )
         largest, likely = (2 * math.pi, "degrees") if unit == "rad" else (LARGEST_LENGTH, "mm")
-        if unit != "1" and max(abs(low), abs(high)) > largest:
+        if unit != "1" and max(abs(low), abs(high)) > largest and not unusual:
             raise EpisodeError(
                 path, f"priors: {name} is [{low:g}, {high:g}], which looks like {likely}",
                 f"give it in {unit}",

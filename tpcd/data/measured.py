@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.data.checks import POSE_COLUMNS, WRENCH_COLUMNS
 from tpcd.data.header import Header, encode_header
+from tpcd.data.limits import POSE_COLUMNS, WRENCH_COLUMNS
 from tpcd.data.table import encode_table, read_table
 from tpcd.errors import EpisodeError
 

@@ -14,11 +14,13 @@ import torch
 
 from tpcd.data.checks import (
     INVERTED,
-    check_episode,
+    check_scale,
+    episode_findings,
     inverted_remedy,
     inverted_sentence,
     wrench_ratios,
 )
+from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
 from tpcd.data.files import locate
 from tpcd.data.header import Header, read_header
@@ -40,7 +42,8 @@ class Data:
     episodes: tuple[Episode, ...]
     fresh: tuple[Episode, ...]
     notes: tuple[str, ...] = ()
-    """What was done about the noise, and doubts about it; part of the verdict."""
+    """What the episodes were accepted in spite of, what was done about the noise, and doubts about
+    it; part of the verdict."""
     warnings: tuple[str, ...] = ()
     """What else looks odd about the episodes."""
     answer: Diagnosis | None = None
@@ -59,18 +62,22 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
     check_one_set_up([header for _, header in places], headers)
     for (table, _), header in zip(places, headers, strict=True):
         if not header.commands_known:
-            return Data((), (), answer=_without_commands(table, header))
+            doubts = [line for line in [doubts_told(header.doubts, table)] if line]
+            return Data((), (), tuple(doubts), answer=_without_commands(table, header))
     episodes, notes = read_noisy(paths, fresh)
     for (table, _), episode in zip(places, episodes, strict=True):
         _check_signs(table, episode)
-    told = [line for episode in episodes for line in check_noise(episode)]
-    warnings = [line for episode in episodes for line in check_episode(episode)]
+    doubts = [doubts_told(episode.doubts, episode.path) for episode in episodes]
+    told = [line for line in doubts if line]
+    told += [line for episode in episodes for line in check_noise(episode)]
+    warnings = [str(each) for episode in episodes for each in episode_findings(episode)]
     count = len(paths)
     given, noted = one_noise(episodes[:count])
     return Data(given, tuple(episodes[count:]), (*notes, *noted, *told), tuple(warnings))
 
 
 def _check_signs(path: Path, episode: Episode) -> None:
+    check_scale(episode)
     # The torque may turn with the point that it is about.
     for name, ratios in wrench_ratios(episode).items():
         if name != "tau" and all(ratio < INVERTED for ratio in ratios):

@@ -22,6 +22,7 @@ import difflib
 import functools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -152,7 +153,8 @@ def log_from_columns(
         streams.append(Stream(path.name, tuple(groups[kind]), times[rows], block))
     values.clear()
     extra = {name: columns[name][full["pose"] if apart else timed] for name in keep}
-    return join(path, streams, euler, delays, (), notes, missing, extra)
+    log = join(path, streams, euler, delays, (), notes, missing, extra)
+    return replace(log, columns={name: column for name, (column, _) in mapped.items()})
 
 
 def read_numbers(

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tpcd.logs.log import Log, LogError
+from tpcd.logs.log import Log, LogError, RotationKind, RotationNumbers
 from tpcd.quality.delay import estimate_delays
 from tpcd.quality.finding import Finding, Weight, overlapping
 from tpcd.quality.recording import check_recording
 from tpcd.quality.stream import MOST_GAP, Stream, forward, gaps_of, read, role, says_again
 
-ROTATIONS = {
+ROTATIONS: dict[RotationKind, tuple[str, ...]] = {
     "rotation vector": ("rx", "ry", "rz"),
     "quaternion": ("qx", "qy", "qz", "qw"),
     "Euler angles": ("e1", "e2", "e3"),
@@ -98,18 +98,20 @@ def join(
         # Where pieces were put together no samples can be, and that is told.
         seam = overlapping(each.start or 0.0, each.end or 0.0, given)
         found += [] if each.kind == "gap" and seam else [each]
-    rotations, kind = _rotations(values, "", euler, path)
+    numbers, rotations = _rotations(values, "", euler, path)
     if rotations is None:
         notes.append("no rotation in the map: taken as constant")
         rotations, missing = Rotation.identity(int(good.sum())), missing | {"rotation"}
-    turned = None
+    turned = target = None
     if command is not None:
-        turned, other = _rotations(values, "u_", euler, path)
+        target, turned = _rotations(values, "u_", euler, path)
         if turned is None:
             notes.append("no rotation of the set point in the map: taken as that of the start")
             turned = Rotation.from_quat(np.tile(rotations[:1].as_quat(), (len(rotations), 1)))
-        elif other != kind:
-            notes.append(f"rotations are read from {kind}, those of the set point from {other}")
+        elif numbers and target and target.kind != numbers.kind:
+            notes.append(
+                f"rotations are read from {numbers.kind}, those of the set point from {target.kind}"
+            )
     if "tau" in values:
         # phi turns from x to z, about -y.
         values["T_y"] = -values["tau"]
@@ -127,6 +129,8 @@ def join(
         tuple(notes),
         moved,
         (*given, *found),
+        numbers,
+        target,
     )
 
 
@@ -249,28 +253,22 @@ def _stack(values: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray
 
 def _rotations(
     values: Mapping[str, np.ndarray], prefix: str, euler: str, path: Path
-) -> tuple[Rotation | None, str]:
-    """The rotations that the map gives, and of which kind; None where it gives none."""
+) -> tuple[RotationNumbers | None, Rotation | None]:
+    """The numbers that the map gives for rotations, and what they mean; None without any."""
     begun = {
         kind: [prefix + name for name in names if prefix + name in values]
         for kind, names in ROTATIONS.items()
     }
-    kinds = [kind for kind, names in begun.items() if names]
+    kinds: list[RotationKind] = [kind for kind in ROTATIONS if begun[kind]]
     if not kinds:
-        return None, ""
+        return None, None
     kind = kinds[0]
     names = [prefix + name for name in ROTATIONS[kind]]
     if len(kinds) > 1 or begun[kind] != names:
         found = ", ".join(name for kind in kinds for name in begun[kind])
         raise LogError(path, f"{found} in the map", f"expected all of {', '.join(names)} alone")
-    entries = np.stack([values[name] for name in names], axis=1)
+    numbers = RotationNumbers(kind, np.stack([values[name] for name in names], axis=1), euler)
     try:
-        if kind == "rotation vector":
-            return Rotation.from_rotvec(entries), kind
-        if kind == "quaternion":
-            return Rotation.from_quat(entries), kind
-        if kind == "Euler angles":
-            return Rotation.from_euler(euler, entries), kind
+        return numbers, numbers.rotations()
     except ValueError as error:
         raise LogError(path, f"{kind} {', '.join(names)}: {error}", "check the map") from error
-    return Rotation.from_rotvec(entries * np.array([0.0, -1.0, 0.0])), kind

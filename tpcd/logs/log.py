@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,6 +23,31 @@ AXES = ("x", "y", "z")
 
 class LogError(FileError):
     """A recording from elsewhere that cannot be used; names file and column or topic."""
+
+
+RotationKind = Literal["quaternion", "rotation vector", "Euler angles", "planar angle"]
+
+
+@dataclass(frozen=True, eq=False)
+class RotationNumbers:
+    """The numbers that rotations were read from, for who asks whether they were read rightly."""
+
+    kind: RotationKind
+    entries: Float[np.ndarray, "n w"]
+    """Quaternions as x, y, z, w; angles and rotation vectors [rad]."""
+    euler: str = ""
+    """Axes of Euler angles, as scipy names them."""
+
+    def rotations(self) -> Rotation:
+        """What they mean; `ValueError` where they are no rotations."""
+        if self.kind == "quaternion":
+            return Rotation.from_quat(self.entries)
+        if self.kind == "Euler angles":
+            return Rotation.from_euler(self.euler, self.entries)
+        if self.kind == "rotation vector":
+            return Rotation.from_rotvec(self.entries)
+        # The planar angle turns from x to z, about -y.
+        return Rotation.from_rotvec(self.entries * np.array([0.0, -1.0, 0.0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +78,12 @@ class Log:
     """The sensors as they were recorded, each on its own clock, before they were joined."""
     findings: tuple[Finding, ...] = ()
     """What checks of the recording found; their times are those of `times`."""
+    numbers: RotationNumbers | None = None
+    """What `rotations` were read from; None for quaternions."""
+    command_numbers: RotationNumbers | None = None
+    """The same of `command_rotations`."""
+    columns: dict[str, str] = field(default_factory=dict)
+    """Names of the map to columns of the table; empty for a bag."""
 
     @property
     def usable(self) -> Bool[np.ndarray, " n"]:
@@ -89,7 +121,15 @@ class Log:
             command_positions=None if commanded is None else commanded[kept],
             command_rotations=None if turned is None else _chosen(turned, chosen),
             extra={name: column[kept] for name, column in self.extra.items()},
+            numbers=_chosen_numbers(self.numbers, chosen),
+            command_numbers=_chosen_numbers(self.command_numbers, chosen),
         )
+
+
+def _chosen_numbers(
+    numbers: RotationNumbers | None, samples: Int[np.ndarray, " k"]
+) -> RotationNumbers | None:
+    return None if numbers is None else replace(numbers, entries=numbers.entries[samples])
 
 
 def _chosen(rotations: Rotation, samples: Int[np.ndarray, " k"]) -> Rotation:

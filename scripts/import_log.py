@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 EPISODE_NAME = "episode"
 EXIT_NOT_ACCEPTED = 3
+EXIT_DOUBTED = 4
+IN_SPITE = "doubts"
 Triple = tuple[float, float, float]
 
 
@@ -64,6 +66,12 @@ class LogImport:
     """Point about which torques are given, in the frame of the end effector [m]."""
     invert_wrench: bool = False
     """The wrench is what the object exerts on the world."""
+    invert_torque: bool = False
+    """Torques alone turn the other way: from z to x in the plane."""
+    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    """Order in which the four numbers come that the map calls qx qy qz qw, or a message x y z w."""
+    invert_rotation: bool = False
+    """Rotations are from the world to the end effector; a planar angle turns from z to x."""
     tare: bool = False
     """Subtract what the sensor reads in the first settled step."""
     window: float = 0.5
@@ -79,7 +87,9 @@ class LogImport:
     keep: tuple[str, ...] = ()
     """Further columns of a table to keep."""
     accept: bool = False
-    """Write the episode without asking."""
+    """Write the episode without asking, unless there are serious doubts."""
+    accept_doubts: bool = False
+    """Write it in spite of serious doubts, too; they stand in its YAML."""
     overwrite: bool = False
     """Replace an earlier import in the folder."""
 
@@ -95,24 +105,31 @@ class LogImport:
 def import_recording(config: LogImport) -> int:
     """Find settled steps, plane, signs and noise of a recording; draw them, and write an episode.
 
-    Returns 0 once the episode is written, 3 where it was not accepted.
+    Returns 0 once the episode is written, 3 where it was not accepted, and 4 where it was written
+    in spite of serious doubts. Doubts of every weight stand in the episode's YAML.
     """
     import sys
 
     from tpcd.data.files import write_together
     from tpcd.figures.imported_log import imported_log
     from tpcd.figures.sinks import save_figure
+    from tpcd.logs.conventions import RotationReading
     from tpcd.logs.importing import Importing, import_log
     from tpcd.logs.plane import Plane, WrenchReading
     from tpcd.logs.settled import Stillness
+    from tpcd.quality.finding import Weight
     from tpcd.results import run_folder, write_results
 
     choices = Importing(
         stiffness=config.stiffness,
         plane=Plane(config.plane_x, config.plane_z, config.origin, config.tool_x or None),
         wrench=WrenchReading(
-            config.wrench_frame, -1.0 if config.invert_wrench else 1.0, config.wrench_point
+            config.wrench_frame,
+            -1.0 if config.invert_wrench else 1.0,
+            config.wrench_point,
+            torque_sign=-1.0 if config.invert_torque else 1.0,
         ),
+        rotation=RotationReading(config.quaternion, config.invert_rotation),
         stillness=Stillness(config.window, config.drift),
         tare=config.tare,
         sensor_std=config.sensor_std or None,
@@ -135,28 +152,43 @@ def import_recording(config: LogImport) -> int:
             planar.motion_left_out,
             planar.wrench_left_out,
             f"{config.log.name}: {len(settled.rows)} rows",
+            [
+                (each.start, each.end)
+                for each in log.findings
+                if each.weight is Weight.LEFT_OUT
+                and each.start is not None
+                and each.end is not None
+            ],
         )
         picture = save_figure(figure, folder, "imported")
         for line in found.account.findings:
             print(line)
         print(_noise_line(found))
-        for line in found.account.doubts:
-            print(f"doubt: {line}", file=sys.stderr)
+        serious = found.account.serious
+        for doubt in found.account.doubts:
+            print(f"{doubt.weight.value}: {doubt}", file=sys.stderr)
         shown = config.out / picture.name
-        accepted = config.accept or _ask(shown)
+        accepted = (
+            config.accept_doubts or (config.accept and not serious) or _ask(shown, len(serious))
+        )
         if accepted:
             write_together(dict(contents))
         write_results(
             folder,
             [],
             findings=found.account.findings,
-            doubts=found.account.doubts,
+            doubts=[f"{doubt.weight.value}: {doubt}" for doubt in found.account.doubts],
             accepted=accepted,
         )
     if not accepted:
-        print(f"no episode written; look at {shown}, then add --accept --overwrite")
+        word = "--accept_doubts" if serious else "--accept"
+        grave = f"{len(serious)} serious doubt{'s' * (len(serious) > 1)}; " if serious else ""
+        print(f"no episode written: {grave}look at {shown}, then add {word} --overwrite")
         return EXIT_NOT_ACCEPTED
     print(f"episode in {config.out / EPISODE_NAME}.csv, drawn in {shown}")
+    if serious:
+        print("written in spite of serious doubts; its YAML keeps them", file=sys.stderr)
+        return EXIT_DOUBTED
     return 0
 
 
@@ -195,17 +227,20 @@ def _noise_line(found: Imported) -> str:
     return "noise of a row: " + ", ".join(f"{name} {value:.2g}" for name, value in values)
 
 
-def _ask(picture: Path) -> bool:
-    """Whether the user takes the import; no where nobody can be asked."""
+def _ask(picture: Path, serious: int) -> bool:
+    """Whether the user takes the import, with a word of its own in spite of serious doubts; no
+    where nobody can be asked."""
     import sys
 
     if not sys.stdin.isatty():
         return False
+    words = (IN_SPITE,) if serious else ("y", "yes")
+    asked = f"in spite of serious doubts? [N, or {IN_SPITE}]" if serious else "? [y/N]"
     try:
-        answer = input(f"drawn in {picture}; write the episode? [y/N] ")
+        answer = input(f"drawn in {picture}; write the episode{' ' * bool(serious)}{asked} ")
     except EOFError:
         return False
-    return answer.strip().lower() in ("y", "yes")
+    return answer.strip().lower() in words
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from tpcd.data.episode import Episode
 from tpcd.data.files import read_episode, write_together
 from tpcd.data.measured import Measured, NoCommandsError, read_measured
+from tpcd.logs.columns import log_from_columns
 from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import LogError
 from tpcd.logs.plane import Plane, WrenchReading, project
@@ -76,16 +77,19 @@ def test_the_episode_is_the_same_in_every_frame(base, tool, origin, point, in_to
 @pytest.mark.parametrize(
     ("frame", "sign", "expected"),
     [
-        ("tool", 1.0, "inverted (see --invert_wrench): then 1% would be left"),
-        ("world", -1.0, "given in tool axes (see --wrench_frame): then"),
-        ("world", 1.0, "inverted (see --invert_wrench) and given in tool axes"),
+        ("tool", 1.0, "the wrench is inverted: then K (x - u) would leave 1% of force"),
+        ("world", -1.0, "the wrench is given in tool axes: then K (x - u) would leave 1% of"),
+        ("world", 1.0, "the wrench is inverted and the wrench is given in tool axes: then"),
     ],
 )
 def test_a_wrench_that_is_read_wrongly_is_noticed_and_how(frame, sign, expected) -> None:
     reading = WrenchReading(frame, sign, TURNED.point)
     choices = choices_of(TURNED, wrench=reading)
     doubts = import_log(log_of(TURNED, SAMPLES), choices).account.doubts
-    assert any(expected in doubt for doubt in doubts)
+    (doubt,) = (each for each in doubts if each.kind == "convention")
+    assert expected in doubt.sentence and doubt.weight is Weight.SERIOUS
+    assert ("--wrench_frame tool" in doubt.remedy) == (frame == "world")
+    assert ("with --invert_wrench" in doubt.remedy) == (sign == 1.0)
 
 
 def test_wrong_stiffness_is_no_matter_of_signs() -> None:
@@ -94,7 +98,10 @@ def test_wrong_stiffness_is_no_matter_of_signs() -> None:
         # A start 0.1 mm off its command would be pressed, if K were 10 kN/m.
         import_log(log_of(TURNED, SAMPLES), replace(choices, stiffness=(1e5, 1e5, 50.0)))
     doubts = import_log(log_of(TURNED, SAMPLES), choices).account.doubts
-    assert any("no sign or frame of the wrench fits" in doubt for doubt in doubts)
+    (doubt,) = (each for each in doubts if each.kind == "convention")
+    assert "frame or unit of rotations and wrench fits" in str(doubt)
+    assert "F_x, F_z and tau are 0.1, 0.1, 1 times it; check stiffness" in str(doubt)
+    assert doubt.weight is Weight.SERIOUS
 
 
 def test_the_zero_of_the_sensor_is_taken_where_it_is_asked_for() -> None:
@@ -150,7 +157,8 @@ def test_steps_use_only_samples_that_no_finding_leaves_out() -> None:
     assert "2 stretches make no row" in told and "9.5, 15.2 s" in told
     assert "left out: left out" in told
     doubted = replace(log, findings=(Finding("unit", Weight.DOUBT, "looks odd"),))
-    assert "looks odd" in import_log(doubted, choices_of(Setting())).account.doubts
+    doubts = import_log(doubted, choices_of(Setting())).account.doubts
+    assert "looks odd" in [str(doubt) for doubt in doubts]
 
 
 def test_without_set_points_stretches_that_are_left_out_make_no_row() -> None:
@@ -195,14 +203,14 @@ def test_motion_and_force_out_of_the_plane_are_said() -> None:
     found = import_log(log, choices_of(Setting()))
     (line,) = (f for f in found.account.findings if "leaves out" in f)
     assert "60 mm of motion" in line and "11 degrees" in line and "5 N of force" in line
-    assert sum("out of the plane: check" in doubt for doubt in found.account.doubts) == 2
+    assert sum("out of the plane: check" in str(doubt) for doubt in found.account.doubts) == 2
 
 
 def test_without_set_points_rows_are_kept_but_are_no_episode(tmp_path: Path) -> None:
     log = replace(log_of(Setting(), SAMPLES), command_positions=None, command_rotations=None)
     found = import_log(log, choices_of(Setting()))
     assert isinstance(found.content, Measured)
-    assert "no set points" in found.account.doubts[0]
+    assert "no set points" in str(found.account.doubts[0])
     write_together(dict(found.files(tmp_path / "run")))
     with pytest.raises(NoCommandsError, match="commands: unknown"):
         read_episode(tmp_path / "run.csv")
@@ -245,3 +253,24 @@ def test_choices_that_cannot_be_are_refused() -> None:
     with pytest.raises(LogError, match="of .* samples can be used"):
         log.during(1e6, None)
     assert RATE * (HOLD + RAMP) * len(EPISODE) == len(log)
+
+
+def test_a_sensor_that_freezes_loses_the_rows_of_that_time_and_it_is_told() -> None:
+    names = {
+        "u": ("u_x", "u_z", "u_phi"),
+        "pose": ("x", "z", "phi"),
+        "wrench": ("F_x", "F_z", "tau"),
+    }
+    columns = {"time": SAMPLES["time"]}
+    columns |= {
+        name: SAMPLES[key][:, k].copy() for key in names for k, name in enumerate(names[key])
+    }
+    step = round(RATE * (HOLD + RAMP))
+    columns["F_z"][6 * step + 20 : 8 * step - 10] = columns["F_z"][6 * step + 20]
+    log = log_from_columns(columns, [f"{name}={name}" for name in columns], Path("frozen.csv"))
+    found = import_log(log, Importing(STIFFNESS))
+    whole = import_log(log_of(Setting(), SAMPLES), choices_of(Setting()))
+    assert len(found.settled.rows) == len(whole.settled.rows) - 2
+    (line,) = (f for f in found.account.findings if f.startswith("left out"))
+    assert "F_z: frozen at" in line and "from 11.6 to 15.09 s" in line
+    assert found.account.doubts == ()

@@ -549,6 +549,6 @@ def test_a_real_recording_is_read_through_its_map() -> None:
     found = import_log(log, Importing((2000.0, 1000.0, 200.0)))
     assert isinstance(found.content, Measured) and found.header.sensor_std is None
     assert "one contact held throughout" in found.content.summary()
-    doubts = " ".join(found.account.doubts)
+    doubts = " ".join(map(str, found.account.doubts))
     for told in ("no set points", "never stood still", "motion is out of the plane"):
         assert told in doubts

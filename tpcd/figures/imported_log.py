@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -35,12 +37,14 @@ def imported_log(
     motion_left_out: Float[np.ndarray, "n 2"],
     wrench_left_out: Float[np.ndarray, "n 3"],
     heading: str = "",
+    left_out: Sequence[tuple[float, float]] = (),
 ) -> Figure:
     """Draw pose and wrench over time [s], wrench against K (x - u), and what is left out.
 
     `samples` and `rows` are x, z, phi [m, m, rad], F_x, F_z, tau [N, N, N·m]; `row_times` begin and
     end of each row's stretch; `spring` K (x - u) of the rows, NaN without commands; left out are
-    motion [m], rotation [rad], force [N] and torque [N·m].
+    motion [m], rotation [rad], force [N] and torque [N·m]. Times that make no row, from `left_out`
+    [s], are grey.
     """
     thin = slice(None, None, max(1, len(times) // MOST_POINTS))
     held = commands is not None
@@ -62,6 +66,10 @@ def imported_log(
         level = factor * rows[:, i]
         (bars,) = panel.plot(row_times.T, np.stack((level, level)), color=TRUTH, linewidth=3)[:1]
         entries["settled rows" if held else "means"] = bars
+        for start, end in left_out:
+            entries["left out"] = panel.axvspan(
+                max(start, times[0]), min(end, times[-1]), color="0.85", linewidth=0, zorder=0
+            )
         panel.set_ylabel(axis_label(_LABELS[i], CHANNEL_UNITS[i]))
     for i, panel in enumerate(axes[6:9] if held else (), start=3):
         low, high = float(spring[:, i - 3].min()), float(spring[:, i - 3].max())

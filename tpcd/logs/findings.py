@@ -1,7 +1,7 @@
 """What an import found, in sentences for the person who decides whether to take it.
 
 `findings` say what was done; `doubts` are what speaks against using it as it is, such as a wrench
-that looks inverted, given in other axes, or a motion that is not planar.
+that looks inverted, given in other axes, or a motion that is not planar. They go with the episode.
 """
 
 from __future__ import annotations
@@ -12,32 +12,51 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.logs.log import Log
-from tpcd.logs.plane import PlanarLog, Plane, WrenchReading, project
+from tpcd.logs.plane import PlanarLog
+from tpcd.logs.readings import BEYOND_NOISE, LEAST_TURN, WITHIN, Reading, Readings, same_episode
 from tpcd.logs.settled import Settled
+from tpcd.quality.finding import Finding, Weight, usable
 
 OUT_OF_PLANE_MOTION = 0.1
 """Motion out of the plane beyond this part of that within it is doubtful."""
 OUT_OF_PLANE_FORCE = 0.2
 """The same of forces."""
-CLEARER = 0.5
-"""Another reading of the wrench is named where it leaves so little of what this one leaves."""
-FELT = 1.0
-"""Forces K (x - u) below this show nothing about the wrench [N]."""
-MISSED = 0.5
-"""A reading that leaves this part of K (x - u) or less fits it."""
+MISLEADS = 0.2
+"""A reading that leaves so much more than another makes an episode that misleads."""
+SWING_TOLD = 0.1
+"""Part of the rotation out of the plane that is worth a word here."""
+LEAST_PRESSED, PRESSED_ALIKE = 0.2, 0.5
+"""A start pressed by less is free [N]; and a part of it within which readings are its negative."""
+LEAST_ZEROED = 2
+"""Rows that show a zero taken in contact."""
+NOTHING_FELT = "K (x - u) is nowhere more than 1 N: no contact is felt"
 
 
 @dataclass(frozen=True)
 class Account:
     """Sentences on one import."""
 
-    findings: tuple[str, ...]
-    doubts: tuple[str, ...]
+    findings: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
+
+    @property
+    def serious(self) -> tuple[Finding, ...]:
+        """The doubts that need a word of their own to be accepted."""
+        return tuple(doubt for doubt in self.doubts if doubt.weight is Weight.SERIOUS)
+
+    def __add__(self, other: Account) -> Account:
+        """Both."""
+        return Account(self.findings + other.findings, self.doubts + other.doubts)
+
+
+def doubt(kind: str, sentence: str, remedy: str = "", serious: bool = False) -> Finding:
+    """What speaks against an import."""
+    return Finding(kind, Weight.SERIOUS if serious else Weight.DOUBT, sentence, remedy=remedy)
 
 
 def left_out(planar: PlanarLog) -> Account:
-    """How much motion and force the plane leaves out."""
+    """How much motion and force the plane leaves out, of the samples that can be used."""
+    planar = _used(planar)
     inside, outside = (
         np.ptp(planar.poses[:, :2], axis=0).max(),
         np.ptp(planar.motion_left_out[:, 0]),
@@ -53,55 +72,149 @@ def left_out(planar: PlanarLog) -> Account:
     )
     doubts = []
     if outside > OUT_OF_PLANE_MOTION * inside:
-        doubts.append("much of the motion is out of the plane: check --plane_x and --plane_z")
+        doubts.append(
+            doubt("plane", "much of the motion is out of the plane: check --plane_x and --plane_z")
+        )
     if force > OUT_OF_PLANE_FORCE * held:
-        doubts.append("much of the force is out of the plane: check the plane and --wrench_frame")
+        told = "much of the force is out of the plane: check the plane and --wrench_frame"
+        doubts.append(doubt("plane", told))
     return Account((finding,), tuple(doubts))
 
 
-def compare_readings(
-    log: Log,
-    plane: Plane,
-    wrench: WrenchReading,
-    settled: Settled,
-    stiffness: Float[np.ndarray, " 3"],
-) -> Account:
-    """Whether the forces at rest are K (x - u), or would be if they were read otherwise.
-
-    Tries both signs, and world and tool axes, on the settled rows.
-    """
-    expected = spring_wrench(settled, stiffness)[:, :2]
-    if settled.commands is None or not len(expected):
-        return Account((), ())
-    size = math.sqrt((expected**2).mean())
-    if np.abs(expected).max() < FELT:
-        return Account((), ("K (x - u) is nowhere more than 1 N: no contact is felt",))
-    found: dict[tuple[str, float], float] = {}
-    for frame in ("world", "tool"):
-        if frame == "tool" and log.missing:
-            continue
-        for sign in (wrench.sign, -wrench.sign):
-            reading = replace(wrench, frame=frame, sign=sign)
-            forces = project(log, plane, reading).wrenches[:, :2]
-            rows = np.stack([forces[first:end].mean(0) for first, end in settled.stretches])
-            found[frame, sign] = math.sqrt(((rows - expected) ** 2).mean()) / size
-    own = found[wrench.frame, wrench.sign]
-    best = min(found, key=lambda reading: found[reading])
-    finding = f"forces at rest differ from K (x - u) by {own:.0%} of its size"
-    if own <= MISSED:
-        return Account((finding,), ())
-    if found[best] > CLEARER * own:
-        return Account(
-            (finding,),
-            ("no sign or frame of the wrench fits K (x - u): check stiffness, plane and units",),
+def account_of(read: Readings | None, planar_angle: bool) -> Account:
+    """What the test of the conventions says: what is left of K (x - u), and what fits better."""
+    if read is None:
+        return Account()
+    own, rows = read.own, len(read.own.rows)
+    if not {"force", "torque"} & set(own.left) and not read.better:
+        return Account((), (doubt("contact", NOTHING_FELT),)) + _untold(read, planar_angle)
+    finding = f"over {rows} settled rows K (x - u) leaves {_left(own)} unexplained"
+    account = Account((finding,)) + _untold(read, planar_angle)
+    if read.better:
+        return account + Account((), (_looks_otherwise(read),))
+    if not own.fits:
+        gain = ", ".join(f"{value:.2g}" for value in read.gain)
+        told = (
+            "no order, sense, sign, frame or unit of rotations and wrench fits K (x - u):"
+            f" it leaves {_left(own)} over {rows} rows; F_x, F_z and tau are {gain} times it"
         )
-    words = []
-    if best[1] != wrench.sign:
-        words.append("inverted (see --invert_wrench)")
-    if best[0] != wrench.frame:
-        words.append(f"given in {best[0]} axes (see --wrench_frame)")
-    doubt = f"the wrench looks {' and '.join(words)}: then {found[best]:.0%} would be left"
-    return Account((finding,), (doubt,))
+        remedy = "check stiffness, plane and units, and which columns are mapped"
+        return account + Account((), (doubt("convention", told, remedy, serious=True),))
+    if own.depth < WITHIN:
+        told = (
+            "forces would act from within the object: by their torques the hand lies beyond the"
+            f" contact they come from, by {-own.depth:.2g} standard errors, as where angle and"
+            " torque are both measured from z to x"
+        )
+        remedy = "look whether phi grows as the hand turns from x to z; else --invert_rotation"
+        return account + Account((), (doubt("mirrored", told, f"{remedy} --invert_torque"),))
+    return account
+
+
+def zeroed_in_contact(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Account:
+    """Whether the sensor reads minus what the arm pressed with at the start where nothing presses.
+
+    Such a sensor had its zero taken in contact; an arm that lags, or a dead band, leaves its
+    readings at zero.
+    """
+    spring = spring_wrench(settled, stiffness)[:, :2]
+    noise = np.hypot(settled.noise[3:5], stiffness[:2] * settled.noise[:2])
+    least = max(BEYOND_NOISE * float(np.linalg.norm(noise)), LEAST_PRESSED)
+    begun = spring[0]
+    if not np.linalg.norm(begun) > least:
+        return Account()
+    allowed = max(least, PRESSED_ALIKE * float(np.linalg.norm(begun))) / 2
+    free = np.linalg.norm(spring, axis=1) < allowed
+    minus = np.linalg.norm(settled.rows[:, 3:5] + begun, axis=1) < allowed
+    rows = int((free & minus).sum())
+    if rows < LEAST_ZEROED or rows < free.sum() / 2:
+        return Account()
+    told = (
+        f"the sensor was zeroed in contact: the arm presses with K (x - u) = ({begun[0]:.2g},"
+        f" {begun[1]:.2g}) N at the start, where the sensor reads 0, and the sensor reads minus"
+        f" that in {rows} rows in which nothing presses"
+    )
+    remedy = "begin with --start at a step that is free, and take its zero there with --tare"
+    return Account((), (doubt("zero", told, remedy, serious=True),))
+
+
+def _looks_otherwise(read: Readings) -> Finding:
+    """The readings that fit much better, and what tells those apart that fit alike."""
+    best, own = read.better[0], read.own
+    said = f"{best.said}: then K (x - u) would leave {_left(best)} unexplained, instead of"
+    said += f" {_left(own)}, over {len(own.rows)} rows ({_times_likelier(best, own)})"
+    remedy = best.remedy
+    for other in read.better[1:3]:
+        if same_episode(best, other):
+            said += f"; the same episode comes of reading that {other.said}"
+        else:
+            said += f"; or {other.said}, which fits alike but makes another episode"
+            if other.depth < WITHIN:
+                said += ", in which forces act from within the object"
+            remedy += f", or {other.remedy}; {_apart(best, other)}"
+    lost = max(own.left.get(name, 0.0) for name in ("force", "torque", "rotation"))
+    told = f"the recording was read otherwise than it looks: {said}"
+    return doubt("convention", told, remedy, serious=lost > MISLEADS)
+
+
+def _untold(read: Readings, planar_angle: bool) -> Account:
+    """What the recording cannot tell about its conventions."""
+    told = [
+        f"nothing in the recording shows whether {other.said}: {_apart(read.own, other)}"
+        for other in read.alike
+    ]
+    if 0 < read.turned < LEAST_TURN:
+        told.append(
+            f"the arm turns by {math.degrees(read.turned):.2g} degrees only, so neither the order"
+            " nor the sense of its rotations shows: turn it by 10 degrees or more while it presses"
+        )
+    elif planar_angle and abs(read.own.depth) < -WITHIN:
+        told.append(
+            "that phi and tau turn from x to z rests on the map alone: nothing in the recording"
+            " shows it; press and slide in both directions to see"
+        )
+    return Account(tuple(told))
+
+
+def _apart(first: Reading, second: Reading) -> str:
+    """The motion that tells two readings apart."""
+    subjects = {change.subject for change in set(first.changes) ^ set(second.changes)}
+    if {"torque", "sense", "order"} & subjects:
+        return (
+            "to tell, turn the hand from x towards z, where phi must grow, and press on what lies"
+            " on its +x side, where tau must be positive"
+        )
+    if {"length", "force", "unit of angles"} & subjects:
+        return "to tell, move the hand by a known distance and hang a known weight on it"
+    return "to tell, turn the hand by 30 degrees or more and press again"
+
+
+def _left(reading: Reading) -> str:
+    """Parts of force and torque, and of rotation if it matters, in words."""
+    told = [f"{part:.0%} of {name}" for name, part in reading.left.items() if name != "rotation"]
+    swing = reading.left.get("rotation", 0.0)
+    if swing > SWING_TOLD:
+        told.append(f"{swing:.0%} of the rotation, out of the plane")
+    return " and ".join(told) or "nothing"
+
+
+def _times_likelier(best: Reading, own: Reading) -> str:
+    return f"10^{(best.likelihood - own.likelihood) / math.log(10):.0f} times as likely"
+
+
+def _used(planar: PlanarLog) -> PlanarLog:
+    kept = usable(planar.times, planar.findings)
+    if not kept.any():
+        return planar
+    return replace(
+        planar,
+        times=planar.times[kept],
+        poses=planar.poses[kept],
+        commands=None,
+        wrenches=planar.wrenches[kept],
+        motion_left_out=planar.motion_left_out[kept],
+        wrench_left_out=planar.wrench_left_out[kept],
+    )
 
 
 def spring_wrench(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "k 3"]:

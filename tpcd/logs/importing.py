@@ -15,19 +15,32 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from tpcd.data.checks import FREE_WRENCH, NOISE_FACTOR, check_episode
+from tpcd.contract import check_stiffness
+from tpcd.data.checks import FREE_WRENCH, NOISE_FACTOR, episode_findings
 from tpcd.data.episode import Episode
 from tpcd.data.files import episode_contents
 from tpcd.data.header import SENSOR_NAMES, Header
 from tpcd.data.measured import Measured, measured_contents
 from tpcd.data.noise import check_noise
 from tpcd.errors import EpisodeError
-from tpcd.logs.findings import Account, compare_readings, left_out, spring_wrench
-from tpcd.logs.log import Log, LogError
+from tpcd.logs.conventions import RotationReading
+from tpcd.logs.findings import (
+    Account,
+    account_of,
+    doubt,
+    left_out,
+    spring_wrench,
+    zeroed_in_contact,
+)
+from tpcd.logs.log import AXES, Log, LogError
 from tpcd.logs.plane import PlanarLog, Plane, WrenchReading, project
+from tpcd.logs.readings import Readings, compare
 from tpcd.logs.settled import BLOCKS, Settled, Stillness, find_settled
-from tpcd.quality.finding import Weight
+from tpcd.logs.units import doubted_units
+from tpcd.quality.finding import Finding, Weight
 
+NO_SET_POINTS = "no set points in the map: steps cannot be told apart, and nothing can be learnt"
+PROVEN = {prefix + axis for prefix in ("", "u_", "F_") for axis in AXES}
 FREE_FORCE = 1.0
 """A start that is pressed harder than this by K (x - u) is not free [N]."""
 
@@ -40,6 +53,7 @@ class Importing:
     """Of the impedance controller [N/m, N/m, N·m/rad] along x, z and about the angle's axis."""
     plane: Plane = field(default_factory=Plane)
     wrench: WrenchReading = field(default_factory=WrenchReading)
+    rotation: RotationReading = field(default_factory=RotationReading)
     stillness: Stillness = field(default_factory=Stillness)
     tare: bool = False
     """Take what the sensor reads in the first settled step for its zero."""
@@ -49,8 +63,7 @@ class Importing:
 
     def __post_init__(self) -> None:
         """Refuse stiffness and noise that cannot be."""
-        if not all(math.isfinite(k) and k > 0 for k in self.stiffness):
-            raise ValueError(f"stiffness is {self.stiffness}, expected three positive numbers")
+        check_stiffness(torch.tensor(self.stiffness, dtype=torch.float64))
         if self.sensor_std is not None and not all(0 <= s < math.inf for s in self.sensor_std):
             raise ValueError(f"sensor_std is {self.sensor_std}, expected six numbers from 0 up")
 
@@ -75,37 +88,36 @@ class Imported:
 
 
 def import_log(log: Log, choices: Importing) -> Imported:
-    """Bring a recording into the plane and cut it into settled rows; raises `LogError`."""
-    planar = project(log, choices.plane, choices.wrench)
-    settled = find_settled(planar, choices.stillness)
-    if choices.tare and len(settled.rows):
-        log, choices = _tared(log, settled, choices)
-        planar = project(log, choices.plane, choices.wrench)
-        settled = find_settled(planar, choices.stillness)
-    _check_rows(log, settled, choices)
+    """Bring a recording into the plane and cut it into settled rows; raises `LogError`.
+
+    Where it stops, and units or conventions look otherwise than they were read, it says that.
+    """
+    log = choices.rotation.of(log)
+    units = doubted_units(log)
+    try:
+        planar, settled, choices = _settle(log, choices)
+    except LogError as error:
+        raise _likelier(error, (*_better(_unsettled(log, choices)), *units)) from error
+    read = _compared(log, settled, choices)
     stiffness = np.array(choices.stiffness)
-    outside = left_out(planar)
-    read = compare_readings(log, choices.plane, choices.wrench, settled, stiffness)
-    told = _told(log)
-    findings = [
-        *log.notes,
-        *told.findings,
-        *_counted(log, planar, settled),
-        *outside.findings,
-        *read.findings,
-    ]
-    doubts = [*told.doubts, *outside.doubts, *read.doubts]
+    if read is not None and "force" in read.own.left and read.own.fits:
+        # Forces that are K (x - u) are proof of their units and of those of positions.
+        units = tuple(e for e in units if not (e.channels and set(e.channels) <= PROVEN))
+    planar_angle = log.numbers is not None and log.numbers.kind == "planar angle"
+    conventions = account_of(read, planar_angle)
+    account = _told(log) + Account(_counted(log, planar, settled), units)
+    account += left_out(planar) + conventions
     restless = _restless(settled, choices.stillness)
     std = choices.sensor_std
     if std is None and not restless:
         std = tuple(float(f"{value:.3g}") for value in settled.noise)
     if restless:
         told = ", ".join(f"{SENSOR_NAMES[k]} {settled.noise[k]:.2g}" for k in restless)
-        doubts.append(f"the arm never stood still, so noise is unknown: means scatter by {told}")
+        still = f"the arm never stood still, so noise is unknown: means scatter by {told}"
+        account += Account((), (doubt("still", still),))
     if choices.tare:
-        findings.append(
-            "zero of the sensor: " + ", ".join(f"{v:.3g}" for v in choices.wrench.offset)
-        )
+        zero = ", ".join(f"{v:.3g}" for v in choices.wrench.offset)
+        account += Account((f"zero of the sensor: {zero}",))
     header = Header(
         stiffness=choices.stiffness,
         sensor_std=std,
@@ -115,32 +127,86 @@ def import_log(log: Log, choices: Importing) -> Imported:
         priors={},
         commands_known=settled.commands is not None,
     )
-    extra = _extra(log, settled)
+    extra, spring = _extra(log, settled), spring_wrench(settled, stiffness)
     if settled.commands is None:
         content = Measured(settled.rows[:, :3], settled.rows[:, 3:], extra)
-        doubts.insert(
-            0, "no set points in the map: steps cannot be told apart, and nothing can be learnt"
-        )
-        findings.append(content.summary())
-        spring = spring_wrench(settled, stiffness)
-        account = Account(tuple(findings), tuple(doubts))
+        nothing = doubt("commands", NO_SET_POINTS)
+        account = Account((*account.findings, content.summary()), (nothing, *account.doubts))
+        header = replace(header, doubts=account.doubts)
         return Imported(planar, settled, spring, account, content, header)
-    episode, finding = _episode(log, settled, header, extra)
-    doubted = check_episode(episode)
-    doubts += [line for line in doubted if not (read.doubts and "times K (pose" in line)]
     try:
-        doubts += check_noise(episode)
+        episode, finding = _episode(log, settled, header, extra)
+    except LogError as error:
+        raise _likelier(error, (*_better(read), *units)) from error
+    except ValueError as error:
+        told = LogError(log.path, str(error).partition("; ")[0], "check --map and --origin")
+        raise _likelier(told, (*_better(read), *units)) from error
+    account += zeroed_in_contact(settled, stiffness)
+    account += Account((finding,)) + _of_episode(episode, bool(conventions.doubts))
+    episode = replace(episode, doubts=account.doubts)
+    header = replace(header, doubts=account.doubts)
+    return Imported(planar, settled, spring, account, episode, header)
+
+
+def _settle(log: Log, choices: Importing) -> tuple[PlanarLog, Settled, Importing]:
+    """The recording in the plane, its settled rows, and the sensor's zero if it is asked for."""
+    planar = project(log, choices.plane, choices.wrench)
+    settled = find_settled(planar, choices.stillness)
+    if choices.tare and len(settled.rows):
+        choices = _tared(log, settled, choices)
+        planar = project(log, choices.plane, choices.wrench)
+        settled = find_settled(planar, choices.stillness)
+    _check_rows(log, settled, choices)
+    return planar, settled, choices
+
+
+def _compared(log: Log, settled: Settled, choices: Importing) -> Readings | None:
+    stiffness = np.array(choices.stiffness)
+    return compare(log, choices.plane, choices.wrench, choices.rotation, settled, stiffness)
+
+
+def _unsettled(log: Log, choices: Importing) -> Readings | None:
+    """The test of the conventions of a recording that cannot be settled as it was read."""
+    try:
+        planar = project(log, replace(choices.plane, tool_x=None), choices.wrench)
+    except LogError:
+        return None
+    return _compared(log, find_settled(planar, choices.stillness), choices)
+
+
+def _better(read: Readings | None) -> tuple[Finding, ...]:
+    """What is said of readings that fit much better."""
+    return account_of(read, False).serious if read is not None and read.better else ()
+
+
+def _likelier(error: LogError, doubts: tuple[Finding, ...]) -> LogError:
+    """The error, or the likely cause of it."""
+    serious = [each for each in doubts if each.weight is Weight.SERIOUS]
+    if not serious:
+        return error
+    remedies = dict.fromkeys(each.remedy for each in serious if each.kind == serious[0].kind)
+    told = f"{serious[0].sentence} (so {error.problem})"
+    return LogError(error.path, told, "; ".join(remedies))
+
+
+def _of_episode(episode: Episode, doubted: bool) -> Account:
+    """What the rows themselves speak against; what conventions explain is said already."""
+    explained = ("inverted", "unit", "wrench", "contact") if doubted else ()
+    found = [each for each in episode_findings(episode) if each.kind not in explained]
+    notes = tuple(str(each) for each in found if each.weight is Weight.NOTE)
+    found = [each for each in found if each.weight is not Weight.NOTE]
+    try:
+        found += [doubt("noise", line) for line in check_noise(episode)]
     except EpisodeError as error:
-        doubts.append(error.problem)
-    account = Account((*findings, finding), tuple(doubts))
-    return Imported(planar, settled, spring_wrench(settled, stiffness), account, episode, header)
+        found.append(doubt("noise", error.problem, error.remedy, serious=True))
+    return Account(notes, tuple(found))
 
 
-def _tared(log: Log, settled: Settled, choices: Importing) -> tuple[Log, Importing]:
+def _tared(log: Log, settled: Settled, choices: Importing) -> Importing:
     first, end = settled.stretches[0]
     zero = np.concatenate((log.forces[first:end].mean(0), log.torques[first:end].mean(0)))
     wrench = replace(choices.wrench, offset=tuple(zero.tolist()))
-    return log, replace(choices, wrench=wrench)
+    return replace(choices, wrench=wrench)
 
 
 def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
@@ -172,13 +238,14 @@ def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
 def _told(log: Log) -> Account:
     """What was found in the recording itself."""
     doubts = (Weight.DOUBT, Weight.SERIOUS)
-    return Account(
-        tuple(f"{each.weight.value}: {each}" for each in log.findings if each.weight not in doubts),
-        tuple(str(each) for each in log.findings if each.weight in doubts),
+    found = [each for each in log.findings if each.kind != "unit"]
+    return Account(log.notes) + Account(
+        tuple(f"{each.weight.value}: {each}" for each in found if each.weight not in doubts),
+        tuple(each for each in found if each.weight in doubts),
     )
 
 
-def _counted(log: Log, planar: PlanarLog, settled: Settled) -> list[str]:
+def _counted(log: Log, planar: PlanarLog, settled: Settled) -> tuple[str, ...]:
     steps = np.diff(log.times)
     rate = f"{len(log)} samples in {log.times[-1]:.3g} s (every {1e3 * np.median(steps):.2g} ms"
     rate += f", at most {1e3 * steps.max():.3g} ms)"
@@ -198,7 +265,7 @@ def _counted(log: Log, planar: PlanarLog, settled: Settled) -> list[str]:
         )
     if settled.brief:
         told.append(f"{settled.brief} holds too short for a row")
-    return told
+    return tuple(told)
 
 
 def _times(times: tuple[float, ...]) -> str:

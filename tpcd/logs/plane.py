@@ -64,6 +64,8 @@ class WrenchReading:
     """Where the torque is taken about, in the frame of the end effector [m]."""
     offset: tuple[float, ...] = (0.0,) * 6
     """What the sensor reads in free air (F, T), to be subtracted [N, N·m]."""
+    torque_sign: float = 1.0
+    """-1 where torques alone turn the other way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +95,7 @@ def project(log: Log, plane: Plane, wrench: WrenchReading) -> PlanarLog:
     force, torque = log.forces - offset[:3], log.torques - offset[3:]
     if wrench.frame == "tool":
         force, torque = log.rotations.apply(force), log.rotations.apply(torque)
-    force, torque = wrench.sign * force, wrench.sign * torque
+    force, torque = wrench.sign * force, wrench.sign * wrench.torque_sign * torque
     torque = torque + np.cross(log.rotations.apply(np.array(wrench.point)), force)
     place = (log.positions - np.array(plane.origin)) @ directions.T
     start = log.rotations[0]
@@ -143,7 +145,8 @@ def _check_components(
     turns = np.abs(directions[2]) > 1e-9
     needed = [(p + a, s) for p in ("", "u_", "F_") for a, s in zip(AXES, spans, strict=True)]
     needed += [("T_" + a, t) for a, t in zip(AXES, turns, strict=True)]
-    if wrench.frame == "tool":
+    planar = log.numbers is not None and log.numbers.kind == "planar angle"
+    if wrench.frame == "tool" and not planar:
         needed += [(kind + a, True) for kind in ("F_", "T_") for a in AXES]
     lacking = [name for name, need in needed if need and name in log.missing]
     if lacking:

@@ -46,21 +46,23 @@ def predict_episodes(config: Predict) -> None:
 
     from tpcd.belief.augmented import with_model
     from tpcd.belief.storage import load_belief
+    from tpcd.commands.fit import fit_line, fit_of, foreign_warning
     from tpcd.commands.kept_model import model_of
     from tpcd.commands.plausibility import check_start_of, run_warnings
     from tpcd.commands.prediction import (
         PredictedRows,
+        joined,
         measured_rows,
         predict_rows,
         rollout_rows,
         score_rows,
         write_prediction,
     )
-    from tpcd.commands.unexplained import fit_of, other_scene_warning
     from tpcd.data import read_episode
     from tpcd.data.files import TABLE_SUFFIXES
     from tpcd.effects.shape_change import UNCHANGED
     from tpcd.errors import RunError
+    from tpcd.files import write_json
     from tpcd.predict import ContactPredictor
     from tpcd.results import format_table
     from tpcd.targets import check_target
@@ -70,7 +72,9 @@ def predict_episodes(config: Predict) -> None:
     torch.set_num_threads(1)
     episodes = [read_episode(path) for path in config.episodes]
     read = [episode.path for episode in episodes if episode.path is not None]
-    check_target(config.out, config.overwrite, read)
+    results = config.out.with_suffix(".results.json")
+    for target in (config.out, results):
+        check_target(target, config.overwrite, read)
     if config.out.suffix not in TABLE_SUFFIXES:
         raise RunError(config.out, "is no .csv or .parquet", "choose a name that ends so")
     model = model_of(config.model)
@@ -110,22 +114,26 @@ def predict_episodes(config: Predict) -> None:
             predicted.append(rollout_rows(predictor, episode, generator, config.of, rows))
         else:
             predicted.append(predict_rows(predictor, episode, config.of, rows))
-        as_measured = not config.rollout and config.of == "measured"
-        fit = fit_of(predicted[-1] if as_measured else predict_rows(predictor, episode), episode)
-        if told := other_scene_warning(fit):
-            print(f"warning: {episode.path}: {told}", file=sys.stderr)
     write_prediction(predicted, config.out)
-    everything = PredictedRows(
-        *(torch.cat([getattr(p, name) for p in predicted]) for name in vars(predicted[0]))
-    )
+    # What fits is told of single steps to what the sensors read, whatever else was asked for.
+    plain = compared is episodes and not config.rollout and config.of == "measured"
+    steps = predicted if plain else [predict_rows(predictor, episode) for episode in episodes]
+    noise = torch.cat([e.sensor_std.expand(len(e) - 1, 6) for e in episodes])
+    fit = fit_of(joined(steps), torch.cat([measured_rows(e)[1:] for e in episodes]), noise)
+    foreign = foreign_warning(fit)
     found = torch.cat([measured_rows(rows)[1:] for rows in compared])
     kind = "rollout" if config.rollout else "one-step"
     against = "rows without noise (.truth.csv)" if known else "rows as measured"
     print(f"{kind} predictions of {len(found)} rows, against the {against}")
-    print(format_table(score_rows(everything, found)))
+    scores = score_rows(joined(predicted), found)
+    print(format_table(scores))
+    print(f"single steps: {fit_line(fit)}")
+    if foreign:
+        print(f"warning: {foreign}", file=sys.stderr)
+    write_json(results, {"scores": scores, "kind": kind, "fit": fit, "warning": foreign})
     if config.of == "true" and not known:
         print("intervals leave sensor noise out, so noisy rows fall outside of them more often")
-    print(f"predictions in {config.out}")
+    print(f"predictions in {config.out}, scores and fit in {results}")
 
 
 if __name__ == "__main__":

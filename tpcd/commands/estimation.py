@@ -24,13 +24,9 @@ from tpcd.belief.settings import CLOSING_SHARE_WITHOUT_LOOPS
 from tpcd.belief.state import EstimatorState, save_state
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
+from tpcd.commands.fit import fit_line, learnt_fit, unknown_warning
 from tpcd.commands.summary import prior_summary, summarise
-from tpcd.commands.unexplained import (
-    fit_sentence,
-    fit_to,
-    unexplained_warning,
-    unknown_object_warning,
-)
+from tpcd.commands.unexplained import unexplained_rows, unexplained_warning
 from tpcd.data.episode import Episode
 from tpcd.exploration import Closing
 from tpcd.files import named, write_json, write_text
@@ -144,22 +140,13 @@ class EstimationRun:
         if self.belief is None or self.state is None:
             raise ValueError("the episode has no transitions, expected at least two rows")
         last = self._close(episode) or self.history[-1]
-        total, fit = len(episode) - 1, fit_to(self.belief, episode)
-        unknown = unknown_object_warning(self.belief, episode.sensor_std[:3])
-        summary = {
-            **summarise(self.belief),
-            "rows": total,
-            "readings_in_90": fit.inside,
-            "unexplained_rows": fit.unexplained,
-            "unknown_object": unknown,
-        }
-        write_json(self.folder / SUMMARY_FILE, summary)
-        self.bar.write(f"fit: {fit_sentence(fit, self.belief)}")
-        for warning in (
-            few_draws_warning(last),
-            unexplained_warning(fit.unexplained, total),
-            unknown,
-        ):
+        total, unexplained = len(episode) - 1, unexplained_rows(episode, self.belief)
+        fit = learnt_fit(episode, self.belief)
+        told = {"rows": total, "unexplained_rows": unexplained, "fit": fit}
+        write_json(self.folder / SUMMARY_FILE, {**summarise(self.belief), **told})
+        self.bar.write(f"fit: {fit_line(fit)}; sides that nothing touched are the prior's guess")
+        unknown = unknown_warning(fit)
+        for warning in (few_draws_warning(last), unexplained_warning(unexplained, total), unknown):
             if warning is not None:
                 self.bar.write(f"warning: {warning}", file=sys.stderr)
         rows = [*self.history[:-1], last]

@@ -13,6 +13,7 @@ from torch import Tensor
 from tpcd.belief.belief import Belief
 from tpcd.belief.prior import make_prior
 from tpcd.commands.estimation import STEPS_FILE, SUMMARY_FILE
+from tpcd.commands.fit import unknown_warning
 from tpcd.commands.unexplained import unexplained_warning
 from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.checks import NO_CONTACT, episode_findings
@@ -131,7 +132,7 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
         unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))
         told = unexplained_warning(unexplained, rows) if unexplained else None
         found += [f"{run}: of what it was learnt from, {told}"] if told else []
-        unknown = summary.get("unknown_object")
+        unknown = unknown_warning(summary["fit"]) if "fit" in summary else None
         found += [f"{run}: {unknown}"] if unknown else []
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "

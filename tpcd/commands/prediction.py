@@ -103,6 +103,12 @@ def rollout_rows(
     )
 
 
+def joined(predicted: list[PredictedRows]) -> PredictedRows:
+    """The rows of several episodes as those of one."""
+    names = vars(predicted[0])
+    return PredictedRows(*(torch.cat([getattr(p, name) for p in predicted]) for name in names))
+
+
 def measured_rows(episode: Episode) -> Float[Tensor, "n 6"]:
     """Pose and wrench of every row side by side."""
     return torch.cat((episode.poses, episode.wrenches), dim=-1)

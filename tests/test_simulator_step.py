@@ -81,7 +81,7 @@ def test_stiffness_that_is_not_positive_is_refused(stiffness):
 def test_poses_of_another_width_are_refused(name):
     given = dict.fromkeys(("pose", "command", "previous"), vector(0, 1, 0))
     given[name] = vector(0, 1)
-    with pytest.raises(ValueError, match=rf"{name} has shape \(2,\), expected three"):
+    with pytest.raises(ValueError, match=rf"{name} has shape \(2,\), expected 3"):
         # The tests' own check of shapes would come first.
         unwrap(simulate_step)(make_scene(), stiffness=STIFFNESS, **given)
 

@@ -72,7 +72,7 @@ def predict_episodes(config: Predict) -> None:
     torch.set_num_threads(1)
     episodes = [read_episode(path) for path in config.episodes]
     read = [episode.path for episode in episodes if episode.path is not None]
-    results = config.out.with_suffix(".results.json")
+    results = config.out.with_name(config.out.name + ".json")
     for target in (config.out, results):
         check_target(target, config.overwrite, read)
     if config.out.suffix not in TABLE_SUFFIXES:

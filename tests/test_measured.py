@@ -187,8 +187,8 @@ def test_rows_too_far_apart_for_an_import_are_told_so_and_no_command_is_missed(t
 
 
 def test_places_of_this_machine_are_left_out_of_lines() -> None:
-    line = "episode in /home/me/runs/measured/import/episode.csv, from /data/sets/a.csv"
-    told = placeless(line, ["/home/me/runs/measured", "/data/sets"])
+    line = "episode in /mnt/runs/measured/import/episode.csv, from /data/sets/a.csv"
+    told = placeless(line, ["/mnt/runs/measured", "/data/sets"])
     assert told == "episode in import/episode.csv, from a.csv"
 
 

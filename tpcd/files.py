@@ -7,7 +7,6 @@ and its place listed under `non_finite`. Nothing heavy is imported here.
 
 from __future__ import annotations
 
-import codecs
 import dataclasses
 import json
 import math
@@ -120,17 +119,3 @@ def to_plain(value: Any, *, flagged: list[str] | None = None, place: str = "") -
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"{place or 'value'}: cannot store a {type(value).__name__}")
-
-
-def decoded(content: bytes) -> str:
-    """Text of a file from elsewhere: UTF-8 or UTF-16 by its byte-order mark, UTF-8, or else
-    Latin-1, in which every byte is a character. Raises `ValueError` for what is no text."""
-    try:
-        if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            return content.decode("utf-16")
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
-    if "\0" in text:
-        raise ValueError("its bytes are no text")
-    return text

@@ -5,11 +5,12 @@ python -m eval.measured.page runs/measured puts page and results of a run beside
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tpcd.cli import run
 from tpcd.files import read_json, write_json, write_text
 from tpcd.quality.quantity import Quantity
 
@@ -38,9 +39,9 @@ def write_page(results: Path, page: Path) -> None:
     write_text(page, page_text(read_json(results)))
 
 
-def publish(run: Path, folder: Path) -> None:
+def publish(source: Path, folder: Path) -> None:
     """Page and results of a run, without places of the machine that it ran on."""
-    results = read_json(run / "results.json")
+    results = read_json(source / "results.json")
     results["config"].pop("out", None)
     results["versions"].pop("folder", None)
     write_json(folder / "results.json", results)
@@ -152,5 +153,18 @@ def _balance(found: Mapping[str, Mapping[str, float]]) -> str:
     return "\n".join(lines)
 
 
+@dataclass(frozen=True)
+class Page:
+    """Settings of the command."""
+
+    run: Path
+    """Run folder that python -m eval.measured wrote."""
+
+
+def write(config: Page) -> None:
+    """Put page and results of a run beside this file."""
+    publish(config.run, Path(__file__).parent)
+
+
 if __name__ == "__main__":
-    publish(Path(sys.argv[1]), Path(__file__).parent)
+    run(write, Page, positional=("run",), prog="python -m eval.measured.page")

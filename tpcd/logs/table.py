@@ -25,7 +25,7 @@ from tpcd.logs.layout import (
     unit_of_name,
 )
 from tpcd.logs.log import LogError
-from tpcd.logs.text import encoding_of, lines_of, read_ends, read_text
+from tpcd.text import encoding_of, lines_of, read_ends, read_text
 
 EXACT = 2**53
 """Whole numbers up to this are exact as floats."""

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tpcd.errors import OutlineError
-from tpcd.files import decoded
 from tpcd.shape.outline import METRES_PER_UNIT
+from tpcd.text import encoding_of, read_text
 
 if TYPE_CHECKING:
     import trimesh
@@ -73,16 +73,15 @@ def load_mesh(path: str | Path, *, unit: str = "m") -> trimesh.Trimesh:
 
 def _content(path: Path, ending: str) -> bytes:
     """The bytes of a mesh file with all text in UTF-8; `OutlineError` where it is cut off."""
-    content = path.read_bytes()
     if ending == ".ply":
-        header, end, body = content.partition(b"end_header")
-        return decoded(header).encode("ascii", "replace") + end + body
+        header, end, body = path.read_bytes().partition(b"end_header")
+        return header.decode("ascii", "replace").encode("ascii", "replace") + end + body
     try:
-        text = decoded(content)
-    except ValueError:
+        text = read_text(path, encoding_of(path))
+    except UnicodeDecodeError:
         text = ""
-    if ending == ".stl" and "facet" not in text:
-        return _binary_stl(path, content)
+    if ending == ".stl" and ("\0" in text or "facet" not in text):
+        return _binary_stl(path, path.read_bytes())
     if comma := DECIMAL_COMMA.search(text):
         line = text.count("\n", 0, comma.end()) + 1
         raise OutlineError(path, f"line {line} has a decimal comma", f"{EXPORT} with points")

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from tpcd.errors import OutlineError
-from tpcd.files import decoded
 from tpcd.shape.mesh import MESH_ENDINGS, load_mesh
 from tpcd.shape.outline import METRES_PER_UNIT, Outline, make_outline
 from tpcd.shape.section import CuttingPlane, cut_mesh
 from tpcd.shape.svg import load_svg
+from tpcd.text import encoding_of, lines_of, read_text
 
 SEPARATOR = re.compile(r"[,;\t ]+")
 WIDE_SEPARATOR = re.compile(r"[;\t ]+")
@@ -99,14 +99,16 @@ def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
     """
     path = Path(path)
     try:
-        lines = decoded(path.read_bytes()).splitlines()
+        text = read_text(path, encoding_of(path))
+        if "\0" in text:
+            raise ValueError("its bytes are no text")
     except FileNotFoundError:
         raise OutlineError(path, "not found", "give a .csv file of x, z rows") from None
     except (OSError, ValueError) as error:
         raise OutlineError(path, f"not readable as text ({error})", "give x, z rows") from None
     points: list[list[float]] = []
     header_seen = False
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(lines_of(text), start=1):
         fields = _fields(line)
         if not fields or fields[0].startswith("#"):
             continue

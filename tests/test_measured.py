@@ -96,6 +96,7 @@ def test_the_episode_of_the_palm_obeys_the_format_and_says_what_was_assumed() ->
         found.poses.numpy(),
         found.wrenches.numpy(),
         found.sensor_std.numpy(),
+        found.stiffness.numpy(),
     )
     assert len(found) == 4
     assert "not recorded" in str(found.notes) and "computed" in str(found.notes)

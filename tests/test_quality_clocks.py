@@ -84,9 +84,19 @@ def test_silence_of_set_points_is_a_gap_only_of_a_sender_that_says_them_again() 
 
 
 def test_samples_too_rare_to_know_rest_by_are_doubted_or_gaps() -> None:
-    rare = stream(np.arange(60.0))
-    assert [f.weight for f in check_clocks([rare]) if f.kind == "rate"] == [Weight.DOUBT]
+    rare, often = stream(np.arange(60.0)), stream(np.arange(0.0, 59.0, 0.01))
+    assert {f.weight for f in check_clocks([rare, often]) if f.kind == "rate"} == {
+        Weight.DOUBT, Weight.NOTE,
+    }  # fmt: skip
     assert len(find_gaps(3.0 * np.arange(60.0))) == 59
+
+
+def test_what_is_sampled_together_however_rarely_has_no_gaps_but_where_it_stops() -> None:
+    times = 10.0 * np.arange(60.0)
+    assert [f.kind for f in check_clocks([stream(times)])] == ["rate"]
+    times[30:] += 60.0
+    gaps = [f for f in check_clocks([stream(times)]) if f.kind == "gap"]
+    assert [(f.start, f.end) for f in gaps] == [(290.0, 360.0)]
 
 
 def test_short_stretches_without_numbers_are_none() -> None:

@@ -32,7 +32,7 @@ class Recording:
     map: tuple[str, ...]
     rate: float | None = None
     """Samples a second [Hz], where no times were recorded."""
-    stiffness: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    stiffness: tuple[float, float, float] = (100.0, 100.0, 50.0)
     """For import, in its plane; of no consequence where commands are unknown."""
     more: tuple[str, ...] = ()
     """Further options of import."""

@@ -27,16 +27,25 @@ SOON = 10
 def check_clocks(streams: Sequence[Stream]) -> tuple[Finding, ...]:
     """What the times of all streams of a recording show, in the times of the streams [s]."""
     found = [*_check_ends(streams)]
+    measured = [stream for stream in streams if role(stream) != "command"]
+    apart = any(not np.array_equal(each.times, measured[0].times) for each in measured)
+    spacings = [np.diff(each.times[read(each)]) for each in measured]
+    # What is sampled together, however rarely, is drawn by no line between its samples.
+    rare = (
+        0.0
+        if apart
+        else max((float(np.median(each)) for each in spacings if len(each)), default=0.0)
+    )
     for stream in streams:
-        found += check_jumps(stream) + check_gaps(stream) + check_rate(stream)
+        found += check_jumps(stream) + check_gaps(stream, rare) + check_rate(stream, apart)
     return (*found, *check_delays(streams))
 
 
-def check_gaps(stream: Stream) -> list[Finding]:
-    """Times in which a stream has no samples."""
+def check_gaps(stream: Stream, rare: float = 0.0) -> list[Finding]:
+    """Times in which a stream has no samples; spacings that are about `rare` [s] are usual."""
     times, kind = stream.times[read(stream)], role(stream)
     told = []
-    for start, end in gaps_of(stream).tolist():
+    for start, end in gaps_of(stream, rare).tolist():
         sentence = (
             f"{stream.name}: no {kind} from {start:.2f} to {end:.2f} s ({end - start:.2g} s, where"
             f" samples come every {_seconds(float(np.median(np.diff(times))))})"
@@ -45,8 +54,8 @@ def check_gaps(stream: Stream) -> list[Finding]:
     return told
 
 
-def check_rate(stream: Stream) -> list[Finding]:
-    """How often samples come, and how regularly."""
+def check_rate(stream: Stream, apart: bool = True) -> list[Finding]:
+    """How often samples come, and how regularly; `apart` says that others have another clock."""
     times = stream.times[read(stream)]
     spacings = np.diff(times[forward(times)])
     if role(stream) == "command" or len(spacings) < 2:
@@ -57,8 +66,9 @@ def check_rate(stream: Stream) -> list[Finding]:
         f" {_seconds(high)})"
     )
     if usual > SLOW:
-        sentence += ": between its samples a straight line is drawn"
-    weight = Weight.DOUBT if usual > SLOW else Weight.NOTE
+        line = ": between its samples a straight line is drawn"
+        sentence += line if apart else ": too rare to know an arm at rest by"
+    weight = Weight.DOUBT if usual > SLOW and apart else Weight.NOTE
     return [Finding("rate", weight, sentence, stream.channels)]
 
 

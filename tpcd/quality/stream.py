@@ -13,6 +13,8 @@ LEAST_GAP = 0.05
 """Shorter than this nothing is a gap [s]: an arm that is pulled by springs moves along a line."""
 MOST_GAP = 2.0
 """Longer than this everything is a gap [s]: an arm makes whole moves meanwhile."""
+RARE = 1.5
+"""But nothing that is not longer by this factor than what all streams are sampled at."""
 AGAIN = 0.2
 """A sender of set points of which this part repeats the one before says again what it holds."""
 NEAR = 50
@@ -55,7 +57,7 @@ def forward(times: Float[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
     return np.concatenate(([True], times[1:] > latest[:-1])) if len(times) else np.ones(0, bool)
 
 
-def gaps_of(stream: Stream) -> Float[np.ndarray, "g 2"]:
+def gaps_of(stream: Stream, rare: float = 0.0) -> Float[np.ndarray, "g 2"]:
     """Last sample before every gap of a stream, and first one after it [s].
 
     A set point holds until the next one comes, so silence is no gap; but where the sender says
@@ -64,7 +66,7 @@ def gaps_of(stream: Stream) -> Float[np.ndarray, "g 2"]:
     if role(stream) == "command" and not says_again(stream):
         return np.empty((0, 2))
     times = stream.times[read(stream)]
-    return find_gaps(times[forward(times)])
+    return find_gaps(times[forward(times)], rare)
 
 
 def says_again(stream: Stream) -> bool:
@@ -73,12 +75,12 @@ def says_again(stream: Stream) -> bool:
     return len(values) > 1 and float((values[1:] == values[:-1]).all(1).mean()) >= AGAIN
 
 
-def find_gaps(times: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g 2"]:
+def find_gaps(times: Float[np.ndarray, " k"], rare: float = 0.0) -> Float[np.ndarray, "g 2"]:
     """Last sample before every gap, and first one after it [s]; times must increase.
 
     A gap is a spacing of several usual ones, where usual is what nine in ten of the spacings just
     before or just after stay within: so neither a stream that changes its rate, nor one whose
-    samples come in bursts, is full of gaps.
+    samples come in bursts, is full of gaps. `rare` is a spacing [s] that all streams have.
     """
     spacings = np.diff(times)
     wide = np.flatnonzero(spacings > LEAST_GAP)
@@ -86,7 +88,9 @@ def find_gaps(times: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g 2"]:
         return np.empty((0, 2))
     before, after = _usual(spacings, wide, -NEAR), _usual(spacings, wide, 1)
     usual = np.nan_to_num(np.fmax(before, after), nan=float(np.median(spacings)))
-    found = wide[spacings[wide] > np.clip(FEW * usual, LEAST_GAP, MOST_GAP)]
+    # What comes every ten seconds is not missing for ten.
+    longest = max(MOST_GAP, RARE * rare)
+    found = wide[spacings[wide] > np.clip(FEW * usual, LEAST_GAP, longest)]
     return np.stack((times[found], times[found + 1]), axis=1)
 
 

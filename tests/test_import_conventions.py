@@ -324,3 +324,13 @@ def test_quaternions_in_the_wrong_order_turn_backwards_about_another_axis() -> N
     moved = (wrong[1:] * wrong[:-1].inv()).as_rotvec()
     found, error = Rotation.align_vectors(moved, -axes)[:2]
     assert error < 1e-6 and found.magnitude() > 0.1
+
+
+def test_a_set_point_without_its_rotation_is_named_where_the_torque_tells() -> None:
+    columns = {"time": SAMPLES["time"]}
+    for key, names in (("u", "u_x u_z"), ("pose", "x z phi"), ("wrench", "F_x F_z tau")):
+        columns |= {name: SAMPLES[key][:, k] for k, name in enumerate(names.split())}
+    log = log_from_columns(columns, [f"{name}={name}" for name in columns], Path("planar.csv"))
+    (doubt,) = convention_doubts(log, Importing(STIFFNESS))
+    assert "the rotation of the set point is not in the map" in doubt.sentence
+    assert doubt.weight is Weight.SERIOUS and "u_phi" in doubt.remedy

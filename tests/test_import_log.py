@@ -239,7 +239,7 @@ def test_the_angle_is_the_turn_about_the_normal() -> None:
 def test_choices_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="expected right angles"):
         Plane(x=(1.0, 0.0, 0.0), z=(1.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match="three positive numbers"):
+    with pytest.raises(ValueError, match="three positive finite numbers"):
         Importing((0.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="six numbers from 0 up"):
         Importing(STIFFNESS, sensor_std=(-1.0,) * 6)

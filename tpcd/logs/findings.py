@@ -12,8 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from tpcd.logs.log import Log
 from tpcd.logs.plane import PlanarLog
-from tpcd.logs.readings import BEYOND_NOISE, LEAST_TURN, WITHIN, Reading, Readings, same_episode
+from tpcd.logs.readings import (
+    BEYOND_NOISE,
+    LEAST_TURN,
+    MISSED,
+    WITHIN,
+    Reading,
+    Readings,
+    same_episode,
+)
 from tpcd.logs.settled import Settled
 from tpcd.quality.finding import Finding, Weight, usable
 
@@ -81,11 +90,12 @@ def left_out(planar: PlanarLog) -> Account:
     return Account((finding,), tuple(doubts))
 
 
-def account_of(read: Readings | None, planar_angle: bool) -> Account:
+def account_of(read: Readings | None, log: Log) -> Account:
     """What the test of the conventions says: what is left of K (x - u), and what fits better."""
     if read is None:
         return Account()
     own, rows = read.own, len(read.own.rows)
+    planar_angle = log.numbers is not None and log.numbers.kind == "planar angle"
     if not {"force", "torque"} & set(own.left) and not read.better:
         return Account((), (doubt("contact", NOTHING_FELT),)) + _untold(read, planar_angle)
     finding = f"over {rows} settled rows K (x - u) leaves {_left(own)} unexplained"
@@ -93,6 +103,14 @@ def account_of(read: Readings | None, planar_angle: bool) -> Account:
     if read.better:
         return account + Account((), (_looks_otherwise(read),))
     if not own.fits:
+        lone = log.numbers is not None and log.command_numbers is None
+        if lone and own.left.get("force", 0.0) <= MISSED:
+            told = (
+                "the rotation of the set point is not in the map, and with that of the start"
+                f" {own.left['torque']:.0%} of the torque is unexplained over {rows} rows"
+            )
+            remedy = "map it: u_qx u_qy u_qz u_qw, u_rx u_ry u_rz, u_e1 u_e2 u_e3 or u_phi"
+            return account + Account((), (doubt("convention", told, remedy, serious=True),))
         gain = ", ".join(f"{value:.2g}" for value in read.gain)
         told = (
             "no order, sense, sign, frame or unit of rotations and wrench fits K (x - u):"

@@ -97,14 +97,13 @@ def import_log(log: Log, choices: Importing) -> Imported:
     try:
         planar, settled, choices = _settle(log, choices)
     except LogError as error:
-        raise _likelier(error, (*_better(_unsettled(log, choices)), *units)) from error
+        raise _likelier(error, (*_better(_unsettled(log, choices), log), *units)) from error
     read = _compared(log, settled, choices)
     stiffness = np.array(choices.stiffness)
     if read is not None and "force" in read.own.left and read.own.fits:
         # Forces that are K (x - u) are proof of their units and of those of positions.
         units = tuple(e for e in units if not (e.channels and set(e.channels) <= PROVEN))
-    planar_angle = log.numbers is not None and log.numbers.kind == "planar angle"
-    conventions = account_of(read, planar_angle)
+    conventions = account_of(read, log)
     account = _told(log) + Account(_counted(log, planar, settled), units)
     account += left_out(planar) + conventions
     restless = _restless(settled, choices.stillness)
@@ -137,10 +136,10 @@ def import_log(log: Log, choices: Importing) -> Imported:
     try:
         episode, finding = _episode(log, settled, header, extra)
     except LogError as error:
-        raise _likelier(error, (*_better(read), *units)) from error
+        raise _likelier(error, (*_better(read, log), *units)) from error
     except ValueError as error:
         told = LogError(log.path, str(error).partition("; ")[0], "check --map and --origin")
-        raise _likelier(told, (*_better(read), *units)) from error
+        raise _likelier(told, (*_better(read, log), *units)) from error
     account += zeroed_in_contact(settled, stiffness)
     account += Account((finding,)) + _of_episode(episode, bool(conventions.doubts))
     episode = replace(episode, doubts=account.doubts)
@@ -174,9 +173,9 @@ def _unsettled(log: Log, choices: Importing) -> Readings | None:
     return _compared(log, find_settled(planar, choices.stillness), choices)
 
 
-def _better(read: Readings | None) -> tuple[Finding, ...]:
+def _better(read: Readings | None, log: Log) -> tuple[Finding, ...]:
     """What is said of readings that fit much better."""
-    return account_of(read, False).serious if read is not None and read.better else ()
+    return account_of(read, log).serious if read is not None and read.better else ()
 
 
 def _likelier(error: LogError, doubts: tuple[Finding, ...]) -> LogError:

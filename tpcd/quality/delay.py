@@ -35,8 +35,8 @@ SPAN = 0.05
 """All is averaged over this to either side, and velocities are differences over it, so that noise
 of single samples counts little [s]; an average of all three obeys what they obey."""
 HARMLESS = {"wrench": 0.1, "command": 0.15}
-"""Less than this is told and not doubted [s]: filters of a sensor take some 10 ms, those that a
-controller puts before its set point some 100 ms."""
+"""Less than this is not doubted, and told as a bound [s]: filters of a sensor take some 10 ms, those
+that a controller puts before its set point some 100 ms."""
 WIDE = 0.12
 """An interval that reaches further than this to either side tells nothing [s]."""
 CLEAR = 0.05
@@ -95,13 +95,17 @@ def check_delays(streams: Sequence[Stream]) -> list[Finding]:
             sentence = f"whether the {name} is late against the pose, motion and force do not tell"
             told.append(Finding("delay", Weight.NOTE, sentence))
             continue
+        if not delay.doubtful:
+            most = max(abs(delay.low), abs(delay.high))
+            sentence = f"{name} and pose are at most {most:.2f} s apart, by motion and force"
+            told.append(Finding("delay", Weight.NOTE, sentence))
+            continue
         sentence = (
             f"the {name} is {abs(delay.value):.2f} s {'late' if delay.value >= 0 else 'early'}"
             f" against the pose ({delay.low:.2f} to {delay.high:.2f} s late)"
         )
-        weight = Weight.DOUBT if delay.doubtful else Weight.NOTE
         remedy = f"if their clocks differ, give --delay {delay.of}={delay.value:.2f}"
-        told.append(Finding("delay", weight, sentence, remedy=remedy if delay.doubtful else ""))
+        told.append(Finding("delay", Weight.DOUBT, sentence, remedy=remedy))
     return told
 
 

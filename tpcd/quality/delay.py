@@ -35,8 +35,8 @@ SPAN = 0.05
 """All is averaged over this to either side, and velocities are differences over it, so that noise
 of single samples counts little [s]; an average of all three obeys what they obey."""
 HARMLESS = {"wrench": 0.1, "command": 0.15}
-"""Less than this is not doubted, and told as a bound [s]: filters of a sensor take some 10 ms, those
-that a controller puts before its set point some 100 ms."""
+"""Less than this is not doubted, and told as a bound [s]: filters of a sensor take some 10 ms, and
+those that a controller puts before its set point some 100 ms."""
 WIDE = 0.12
 """An interval that reaches further than this to either side tells nothing [s]."""
 CLEAR = 0.05

@@ -19,7 +19,8 @@ class Predict:
     """Episodes to predict, one or more."""
     out: Path
     """File for the predictions, .csv or .parquet: step, then x_mean, x_sd, x_q05, x_q95 and the
-    same of z, phi, F_x, F_z, tau; of several episodes a column episode (0, 1, ...) comes first."""
+    same of z, phi, F_x, F_z, tau; of several episodes a column episode (0, 1, ...) comes first.
+    Scores, and how the recording fits the belief, go into FILE.json."""
     model: Path | None = None
     """A model.yaml whose effects join the belief, drawn from what it says was found."""
     rollout: bool = False
@@ -72,7 +73,7 @@ def predict_episodes(config: Predict) -> None:
     torch.set_num_threads(1)
     episodes = [read_episode(path) for path in config.episodes]
     read = [episode.path for episode in episodes if episode.path is not None]
-    results = config.out.with_name(config.out.name + ".json")
+    results = config.out.with_name(f"{config.out.name}.json")
     for target in (config.out, results):
         check_target(target, config.overwrite, read)
     if config.out.suffix not in TABLE_SUFFIXES:

@@ -94,7 +94,6 @@ WRONG = {
     "ragged": ([[0.0, 0.1], [0.0]], TypeError, "pose is [[0.0, 0.1], [0.0]], expected rows"),
     "truths": ([True, False, True], TypeError, "pose holds bool, expected rows of 3 numbers"),
     "complex": (torch.zeros(3, dtype=torch.cfloat), TypeError, "pose holds complex64"),
-    "NaN": ([[0, 0, 0], [0, np.nan, 0]], ValueError, "pose is nan at [1, 1], expected a finite"),
     "rows": (torch.zeros(3, 3), ValueError, "command has 2 rows, expected 1 or 3 as the others"),
     "device": (torch.zeros(3, device="meta"), ValueError, "pose is on meta, expected it on cpu"),
     "millimetres": ([0.0, 120.0, 0.0], ValueError, "it looks like millimetres"),
@@ -113,6 +112,14 @@ def test_what_is_no_pose_is_refused_in_one_line_that_says_what_is_expected(predi
         with pytest.raises(kind) as raised:
             call()
         assert told in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_a_row_that_is_not_finite_is_not_answered_and_a_noise_that_is_not_is_refused(predictor):
+    found = predictor.predict([POSE, [0.0, np.nan, 0.0]], COMMAND)
+    assert found.answered.tolist() == [True, False]
+    for name, std in (("pose_std", [1e-4, np.inf, 1e-4]), ("sensor_std", [-1.0] * 6)):
+        with pytest.raises(ValueError, match=f"{name} is .*expected"):
+            predictor.predict(POSE, COMMAND, **{name: std})
 
 
 STEP_WRONG = {key: WRONG[key] for key in ("a number", "two numbers", "nothing", "words", "truths")}

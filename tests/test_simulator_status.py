@@ -20,11 +20,15 @@ from simulator_steps import ENGINES, FRICTIONS
 from torch import Tensor
 
 from tpcd.contact import ContactScene, terrain_gaps
+from tpcd.data.header import parse_header
+from tpcd.errors import EpisodeError
+from tpcd.parameters import LARGEST_FRICTION
 from tpcd.planar import transform_points
 from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
-from tpcd.simulator.record import LARGEST_FRICTION, START_DEPTH
+from tpcd.simulator.record import START_DEPTH
 from tpcd.simulator.rest import distance_from_rest
 from tpcd.simulator.settle import settle_from
+from tpcd.truth.scene import draw_scene
 
 DEPTH = 1e-6
 """What is converged is no deeper inside a terrain than this [m], ten times the tolerance."""
@@ -110,7 +114,7 @@ def test_what_is_converged_is_at_rest_at_any_stiffness_size_angle_and_distance(s
         move = torch.cat((far * uniform(-1, 1, n, 2), turn * uniform(-1, 1, n, 1)), -1)
         stiffness = torch.where(few[:, None], log(1e-3, 1e9, n, 3), STIFFNESS)
         command = start + move
-        found = simulate_step(scene, start, command, stiffness)
+        found = simulate_step(scene, start, command, stiffness, unusual=True)
         true = found.status <= StepStatus.START_INSIDE
         good += int(true.sum())
         assert torch.isfinite(found.pose[true]).all() and torch.isfinite(found.wrench[true]).all()
@@ -180,3 +184,14 @@ def test_an_answer_that_something_else_has_moved_is_not_at_rest():
     for move in ((0, 1e-4, 0), (0, -1e-4, 0), (1e-4, 0, 0), (0, 0, 2e-3)):
         assert 0.9e-4 < off(settled.pose + vector(*move)) < 2e-4
     assert math.isinf(off(settled.pose + math.nan))
+
+
+def test_a_scene_or_a_prior_with_more_friction_is_refused_with_the_bound(tmp_path):
+    corners = BOX.numpy()
+    draw_scene("box", corners, torch.Generator(), fixed={"friction": LARGEST_FRICTION})
+    for friction in (1.01 * LARGEST_FRICTION, 1e6, math.inf):
+        with pytest.raises(ValueError, match=f"friction is .*expected 0 to {LARGEST_FRICTION:g}"):
+            draw_scene("box", corners, torch.Generator(), fixed={"friction": friction})
+    known = {"stiffness": [100, 100, 50], "priors": {"friction": [0.1, 1e5]}}
+    with pytest.raises(EpisodeError, match=f"at most {LARGEST_FRICTION:g}"):
+        parse_header(known, tmp_path / "e.yaml")

@@ -33,6 +33,9 @@ DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {
     "wall_position": (0.09, 0.18),
 }
 """Priors used in simulation, uniform on [low, high]; floor and wall in world coordinates."""
+LARGEST_FRICTION = 100.0
+"""Largest friction coefficient. Nothing slips there unless it is pulled within half a degree along
+the terrain; with more, rounding decides which of the rows of a contact holds."""
 
 
 @dataclass(frozen=True)

@@ -75,9 +75,9 @@ class ContactPredictor:
         """Predict n transitions from pose and command [m, m, rad].
 
         One row may be given without its axis, and one pose for many commands. Raises TypeError and
-        ValueError for other shapes, what is not finite and, unless `unusual`, what looks like
-        millimetres or degrees (see `tpcd.contract`). Where particles take the pose to be inside a
-        terrain, `Prediction.start_inside` says so.
+        ValueError for other shapes and, unless `unusual`, for what looks like millimetres or
+        degrees (see `tpcd.contract`). A row that is not finite is not answered. Where particles
+        take the pose to be inside a terrain, `Prediction.start_inside` says so.
 
         `previous` is the command at which the arm rested in `pose` (None: without load).
         `pose_std` is the noise of `pose` where it was measured (None: exact). With
@@ -284,7 +284,6 @@ def _asked(
         if given is None and name == "previous":
             continue
         rows = as_numbers(name, given, 3, axes=2, device=cpu).double()
-        check_finite(name, rows)
         check_pose(name, rows, unusual)
         found.append((name, rows))
     count = max(len(rows) for _, rows in found)

@@ -21,7 +21,7 @@ import yaml
 from tpcd.contract import LARGEST_LENGTH, check_stiffness
 from tpcd.data.doubts import encode_doubts, parse_doubts
 from tpcd.errors import EpisodeError
-from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
+from tpcd.parameters import LARGEST_FRICTION, SCENE_NAMES, SCENE_UNITS
 from tpcd.quality.finding import Finding
 
 KEYS = (
@@ -212,6 +212,11 @@ def _priors(path: Path, content: Any, unusual: bool) -> dict[str, tuple[float, f
             raise EpisodeError(
                 path, f"priors: {name} starts at {low:g}, expected a positive range", "raise low"
             )
+        if name == "friction" and high > LARGEST_FRICTION:
+            raise EpisodeError(
+                path, f"priors: friction ends at {high:g}, expected at most {LARGEST_FRICTION:g}",
+                "nothing slips from there on",
+            )  # fmt: skip
         priors[name] = (low, high)
     return priors
 

@@ -17,6 +17,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from tpcd import parameters
 from tpcd.qp import compiled, problem
 from tpcd.simulator import events, implicit, loaded, record, settle, walk, wedge
 from tpcd.simulator.kernel_element import step_element
@@ -34,7 +35,7 @@ def source_stamp(*more: ModuleType) -> int:
     """
     digest = hashlib.sha256()
     parts = [part for name, part in sorted(sys.modules.items()) if name.startswith(__name__)]
-    others = (compiled, problem, events, implicit, loaded, record, settle, walk, wedge)
+    others = (compiled, problem, parameters, events, implicit, loaded, record, settle, walk, wedge)
     for module in (*parts, *others, *more):
         digest.update(Path(str(module.__file__)).read_bytes())
     return int.from_bytes(digest.digest()[:6], "big")

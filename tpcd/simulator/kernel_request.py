@@ -7,10 +7,10 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
+from tpcd.parameters import LARGEST_FRICTION
 from tpcd.simulator.kernel_geometry import build_chains
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_space import Law
-from tpcd.simulator.record import LARGEST_FRICTION
 from tpcd.simulator.settle import PROBE_ANGLE
 
 

@@ -15,15 +15,14 @@ from typing import Literal
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tpcd.parameters import LARGEST_FRICTION
+
 DEGREES = 3
 """Degrees of freedom of the object in the plane."""
 LEAST_FINEST = 1e-6
 """Shorter parts cannot be told from rounding."""
 MOST_PARTS = 100_000
 """Parts of equal length that a path may be cut into."""
-LARGEST_FRICTION = 100.0
-"""Largest friction coefficient. Nothing slips there unless it is pulled within half a degree along
-the terrain; with more, rounding decides which of the rows of a contact holds."""
 START_DEPTH = 1e-3
 """A start pose further inside a terrain than this [m] is no error of a measurement."""
 REST_TOLERANCE = 10.0

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from tpcd.contact import ContactScene
 from tpcd.contract import as_numbers, check_pose, check_stiffness
+from tpcd.parameters import LARGEST_FRICTION
 from tpcd.simulator import native
 from tpcd.simulator.lowest import lowest_points
 from tpcd.simulator.path import follow_path
 from tpcd.simulator.record import (
-    LARGEST_FRICTION,
     ContactMode,
     StepSettings,
     StepStatus,

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
+from tpcd.parameters import DEFAULT_BOUNDS, LARGEST_FRICTION, SCENE_NAMES
 from tpcd.planar import transform_points
 from tpcd.truth.protocol import Truth
 
@@ -47,6 +47,11 @@ class Scene:
     """Diagonal of K [N/m, N/m, N·m/rad]."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.friction <= LARGEST_FRICTION:
+            raise ValueError(
+                f"friction is {self.friction:g}, expected 0 to {LARGEST_FRICTION:g}, where nothing"
+                " slips any more"
+            )
         floor_gap, wall_gap = self.clearances(self.start_pose)
         for name, gap in (("floor", floor_gap), ("wall", wall_gap)):
             if gap <= 0:

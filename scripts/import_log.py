@@ -86,6 +86,8 @@ class LogImport:
     """Name of the object, for the episode's YAML."""
     keep: tuple[str, ...] = ()
     """Further columns of a table to keep."""
+    unusual: bool = False
+    """Take springs below 10 N/m and lengths beyond 5 m as they are, and not for other units."""
     accept: bool = False
     """Write the episode without asking, unless there are serious doubts."""
     accept_doubts: bool = False
@@ -134,6 +136,7 @@ def import_recording(config: LogImport) -> int:
         tare=config.tare,
         sensor_std=config.sensor_std or None,
         object=config.object,
+        unusual=config.unusual,
     )
     log = _read(config)
     if config.start is not None or config.end is not None:

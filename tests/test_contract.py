@@ -182,7 +182,7 @@ def test_an_episode_takes_lists_and_arrays_and_refuses_other_shapes(episode: Epi
         ("poses", episode.poses[:-1], "poses has shape (3, 3), expected (4, 3)"),
         ("poses", None, "poses is NoneType, expected 3 numbers"),
         ("commands", 1e3 * episode.commands, "commands reaches"),
-        ("stiffness", [0.1, 0.1, 50.0], "it looks like N/mm; convert it, or say unusual=True"),
+        ("stiffness", [0.1, 0.1, 50.0], "N/mm; convert it, or insist with unusual=True"),
         ("sensor_std", [1e-3] * 5, "sensor_std has shape (5,), expected 6 numbers"),
     ):
         with pytest.raises((TypeError, ValueError)) as raised:

@@ -59,6 +59,18 @@ def words(log: Path, out: Path, *more: str) -> tuple[str, ...]:
     return (str(log), *given, "--out", str(out), *more)
 
 
+def test_springs_that_look_like_another_unit_are_taken_when_insisted_on(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    soft = [str(5.0) if word in ("100", "50") else word for word in words(log, tmp_path / "out")]
+    assert importing(*soft, "--accept", "--accept_doubts") == 2
+    assert "it looks like N/mm" in capsys.readouterr().err
+    assert importing(*soft, "--accept", "--accept_doubts", "--unusual") == 4
+    episode = read_episode(tmp_path / "out" / "episode.csv")
+    assert episode.unusual and episode.stiffness.tolist() == [5.0, 5.0, 5.0]
+
+
+
 def test_a_recording_becomes_an_episode(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

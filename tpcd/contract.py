@@ -25,7 +25,7 @@ LEAST_STIFFNESS, LARGEST_STIFFNESS = 10.0, 1e6
 stiffer."""
 LARGEST_TURNING_STIFFNESS = 1e4
 """The same about its axis [N·m/rad]; stiffer ones are taken for N·mm/rad."""
-INSIST = "or say unusual=True if that is meant"
+INSIST = "or insist with unusual=True (in a YAML unusual: true, in an import --unusual)"
 
 
 def as_numbers(

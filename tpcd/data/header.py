@@ -115,7 +115,8 @@ def parse_header(content: Any, path: Path) -> Header:
         check_stiffness(torch.tensor(stiffness, dtype=torch.float64), unusual)
     except ValueError as error:
         fault, _, remedy = str(error).partition("; ")
-        raise EpisodeError(path, fault, remedy.replace("=True", ": true")) from error
+        insist = "convert it, or insist with unusual: true" if remedy else ""
+        raise EpisodeError(path, fault, insist) from error
     sensor_std = _sensor_std(path, content["sensor_std"]) if "sensor_std" in content else None
     time_step = content.get("time_step_s")
     if time_step is not None:

@@ -60,10 +60,12 @@ class Importing:
     sensor_std: tuple[float, ...] | None = None
     """Noise of a row; None to take it from the still stretches."""
     object: str | None = None
+    unusual: bool = False
+    """That springs and lengths that look like other units are meant so."""
 
     def __post_init__(self) -> None:
         """Refuse stiffness and noise that cannot be."""
-        check_stiffness(torch.tensor(self.stiffness, dtype=torch.float64))
+        check_stiffness(torch.tensor(self.stiffness, dtype=torch.float64), self.unusual)
         if self.sensor_std is not None and not all(0 <= s < math.inf for s in self.sensor_std):
             raise ValueError(f"sensor_std is {self.sensor_std}, expected six numbers from 0 up")
 
@@ -125,6 +127,7 @@ def import_log(log: Log, choices: Importing) -> Imported:
         time_step_s=None,
         priors={},
         commands_known=settled.commands is not None,
+        unusual=choices.unusual,
     )
     extra, spring = _extra(log, settled), spring_wrench(settled, stiffness)
     if settled.commands is None:
@@ -330,5 +333,6 @@ def _episode(
         object=header.object,
         notes=header.notes,
         extra=extra,
+        unusual=header.unusual,
     )
     return episode, finding

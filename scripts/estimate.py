@@ -56,11 +56,10 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
-    from tpcd.commands.plausibility import check_start_pose, contradicted_start
+    from tpcd.commands.plausibility import check_start_pose, contradicted_start, keep_doubts
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
     from tpcd.data.checks import check_units
-    from tpcd.data.doubts import doubts_told
     from tpcd.errors import EpisodeError, RunError
     from tpcd.exploration import Estimator
     from tpcd.results import (
@@ -94,6 +93,7 @@ def estimate_episode(config: Estimate) -> None:
         )
     with opened as folder:
         keep_model(model, folder, config.model)
+        keep_doubts(episode, folder)
         state = load_state(folder, episode, config.prior)
         settings = EstimatorSettings(
             sampler=SamplerSettings(particles=config.particles),
@@ -115,13 +115,7 @@ def estimate_episode(config: Estimate) -> None:
         # The paper's filter does not know that the start is free.
         paper = config.estimator == "paper"
         contradicted = "" if paper else contradicted_start(episode, belief)
-        write_results(
-            folder,
-            table,
-            seeds=[config.seed],
-            contradicted=contradicted,
-            episode_doubts=doubts_told(episode.doubts, episode.path) or "",
-        )
+        write_results(folder, table, seeds=[config.seed], contradicted=contradicted)
     if contradicted:
         raise EpisodeError(config.episode, contradicted, f"what was found is in {config.out}")
     print(

@@ -119,19 +119,23 @@ def predict_episodes(config: Predict) -> None:
     # What fits is told of single steps to what the sensors read, whatever else was asked for.
     plain = compared is episodes and not config.rollout and config.of == "measured"
     steps = predicted if plain else [predict_rows(predictor, episode) for episode in episodes]
-    noise = torch.cat([e.sensor_std.expand(len(e) - 1, 6) for e in episodes])
-    fit = fit_of(joined(steps), torch.cat([measured_rows(e)[1:] for e in episodes]), noise)
-    foreign = foreign_warning(fit)
+    fits = [
+        fit_of(step, measured_rows(episode)[1:], episode.sensor_std)
+        for step, episode in zip(steps, episodes, strict=True)
+    ]
+    foreign = [foreign_warning(fit) for fit in fits]
     found = torch.cat([measured_rows(rows)[1:] for rows in compared])
     kind = "rollout" if config.rollout else "one-step"
     against = "rows without noise (.truth.csv)" if known else "rows as measured"
     print(f"{kind} predictions of {len(found)} rows, against the {against}")
     scores = score_rows(joined(predicted), found)
     print(format_table(scores))
-    print(f"single steps: {fit_line(fit)}")
-    if foreign:
-        print(f"warning: {foreign}", file=sys.stderr)
-    write_json(results, {"scores": scores, "kind": kind, "fit": fit, "warning": foreign})
+    for path, fit, warning in zip(read, fits, foreign, strict=True):
+        name = f"{path.name}, " if len(read) > 1 else ""
+        print(f"{name}single steps: {fit_line(fit)}")
+        if warning:
+            print(f"warning: {path.name}: {warning}", file=sys.stderr)
+    write_json(results, {"scores": scores, "kind": kind, "fits": fits, "warnings": foreign})
     if config.of == "true" and not known:
         print("intervals leave sensor noise out, so noisy rows fall outside of them more often")
     print(f"predictions in {config.out}, scores and fit in {results}")

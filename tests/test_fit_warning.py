@@ -105,8 +105,8 @@ def test_a_recording_of_another_scene_is_told_with_its_figures_and_one_of_the_sa
             assert "of the readings lie in their 90 % intervals" in shown.out
             assert ("does not fit this belief" in shown.err) is foreign
             results = read_json(target.with_name(f"{target.name}.json"))
-            assert results["fit"]["fits"] is not foreign
-            assert (results["warning"] is not None) is foreign
+            assert results["fits"][0]["fits"] is not foreign
+            assert (results["warnings"][0] is not None) is foreign
             assert len(results["scores"]) == 6
 
 

@@ -110,3 +110,10 @@ def test_a_face_of_a_missing_vertex_is_named(tmp_path):
     path = tmp_path / "part.obj"
     path.write_text(OBJ + "f 1 2 99\n")
     assert "a face names a vertex that is not there" in refusal(path)
+
+
+def test_an_obj_that_counts_from_zero_is_refused(tmp_path):
+    path = tmp_path / "part.obj"
+    faces = "".join("f " + " ".join(str(corner) for corner in face) + "\n" for face in BOX.faces)
+    path.write_text(OBJ[: OBJ.index("f ")] + faces)
+    assert "counts vertices from 0" in refusal(path)

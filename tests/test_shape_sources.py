@@ -73,6 +73,18 @@ def test_decimal_commas_are_read_where_something_else_parts_the_numbers(tmp_path
     assert outline.area == pytest.approx(0.0054)
 
 
+def test_blanks_before_a_comma_make_no_decimals(tmp_path):
+    path = write(tmp_path / "plate.csv", "0 ,0\n60 ,0\n60 ,90\n0 ,90\n")
+    assert load_outlines(path, unit="mm")["plate"].area == pytest.approx(0.0054)
+
+
+def test_the_unit_of_a_header_is_taken_unless_another_is_given(tmp_path):
+    path = write(tmp_path / "plate.csv", "x [mm];z [mm]\n0;0\n60;0\n60;90\n0;90\n")
+    assert load_outlines(path)["plate"].area == pytest.approx(0.0054)
+    with pytest.raises(OutlineError, match="its header is in mm; expected one unit, cm"):
+        load_outlines(path, unit="cm")
+
+
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
 def test_a_csv_is_read_in_every_encoding(tmp_path, encoding):
     path = tmp_path / "plate.csv"
@@ -95,6 +107,10 @@ def test_a_csv_in_millimetres_without_saying_so_gets_the_hint(tmp_path):
         ("x,z\nmore,words\n0,0\n", "line 2 is 'more,words'"),
         ("0,0\n0.1,0,5\n0.1,0.1\n", "line 2 has 3 numbers"),
         ("0,0,0,0\n", "part x and z by a semicolon"),
+        ("0..0,0\n0.1,0\n0.1,0.1\n", "line 1 is '0..0,0'"),
+        ("\u22120.1,0\n0.1,0\n0.1,0.1\n", "line 1 is"),
+        ("z,x\n0,0\n0.1,0\n0.1,0.1\n", "line 1 begins with z"),
+        ("x [mm],z [cm]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in cm and mm"),
         ("0,0\n0.1\n0.1,0.1\n", "line 2 has 1 numbers"),
         ("0,0\n0.1,nan\n0.1,0.1\n", "vertex 1 is (0.1, nan)"),
         ("0,0\n0.1,0.1\n0.1,0\n0,0.1\n", "crosses or touches itself at (0.05, 0.05) m"),

@@ -253,10 +253,26 @@ def test_lines_beside_a_shape_are_left_out_and_told(tmp_path):
         "<style>.h{display:none}</style><rect width='60' height='90'/>",
         "<style>rect{width:60px}</style><rect width='6' height='9'/>",
         "<rect style='transform: scale(2)' width='60' height='90'/>",
+        "<rect style='scale:.5' width='60' height='90'/>",
+        "<circle style='r:20px' r='10'/>",
+        "<defs><style>.a{transform:scale(.5)}</style></defs><rect width='60' height='90'/>",
     ],
 )
 def test_styles_that_change_shapes_are_refused(tmp_path, body):
     assert "a style hides, moves or sizes shapes" in refusal(drawing(tmp_path, body))
+
+
+@pytest.mark.parametrize("attribute", ["clip-path", "mask"])
+def test_what_is_clipped_is_refused(tmp_path, attribute):
+    body = f"<rect {attribute}='url(#c)' width='60' height='90'/>"
+    assert "clipped or masked" in refusal(drawing(tmp_path, body))
+
+
+def test_lengths_with_units_keep_them_or_are_refused(tmp_path):
+    path = drawing(tmp_path, '<rect width="60mm" height="9cm"/>', "")
+    assert "width='60mm' has a unit of its own; give --unit px" in refusal(path, unit="mm")
+    (outline,) = load_svg(path, unit="px").values()
+    assert outline.size == pytest.approx((0.06, 0.09))
 
 
 def test_styles_of_colour_change_nothing(tmp_path):

@@ -22,12 +22,13 @@ from tpcd.data.episode import Episode
 from tpcd.data.table import row_name
 from tpcd.effects.shape_change import ShapeChange
 from tpcd.errors import EpisodeError
-from tpcd.files import read_json
+from tpcd.files import read_json, write_json
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
 from tpcd.results import RESULTS_FILE
 from tpcd.shape.protocol import Shape
 
+DOUBTS_FILE = "doubts.json"
 DRAWS = 1000
 """Draws from the prior; what one draw in 100 explains is missed 4 times in 100,000."""
 OUTLINE_ERROR = 5e-3
@@ -117,16 +118,24 @@ def contradicted_start(episode: Episode, belief: Belief) -> str:
     )
 
 
+def keep_doubts(episode: Episode, run: Path) -> None:
+    """Write beside a belief, before there is one, what its episode was accepted in spite of."""
+    told = doubts_told(episode.doubts, episode.path)
+    if told:
+        write_json(run / DOUBTS_FILE, {"episode_doubts": told})
+
+
 def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
     """What is suspicious about predicting these episodes from a run."""
     found = []
     if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
-        found.append(f"{run} was stopped before its last row; its belief is of the rows so far")
+        found.append(f"{run} was stopped before it was done; its belief is of the rows so far")
+    if (run / DOUBTS_FILE).is_file():
+        doubts = read_json(run / DOUBTS_FILE)["episode_doubts"]
+        found.append(f"{run} was learnt from an episode with doubts: {doubts}")
     if (run / RESULTS_FILE).is_file():
-        results = read_json(run / RESULTS_FILE)
-        contradicted, doubts = results.get("contradicted"), results.get("episode_doubts")
+        contradicted = read_json(run / RESULTS_FILE).get("contradicted")
         found += [f"{run} was learnt from {contradicted}"] if contradicted else []
-        found += [f"{run} was learnt from an episode with doubts: {doubts}"] if doubts else []
     if (run / SUMMARY_FILE).is_file():
         summary = read_json(run / SUMMARY_FILE)
         unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))

@@ -237,6 +237,8 @@ def _check_order(columns: Columns, times: np.ndarray, timed: np.ndarray, path: P
     if not len(timed):
         raise LogError(path, "no row has a time", "check the map of columns")
     held = times[timed]
+    if len(held) > 2 and 2 * int((np.diff(held) < 0).sum()) > len(held):
+        raise LogError(path, "time runs backwards from row to row", "sort the rows by time")
     back = np.flatnonzero(np.diff(held) < -JUMP)
     if len(back):
         k = int(back[0])

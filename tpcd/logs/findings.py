@@ -39,6 +39,9 @@ LEAST_PRESSED, PRESSED_ALIKE = 0.2, 0.5
 LEAST_ZEROED = 2
 """Rows that show a zero taken in contact."""
 NOTHING_FELT = "K (x - u) is nowhere more than 1 N: no contact is felt"
+LEFT_OVER = 0.15
+"""Part of a channel that K (x - u) does not explain from which it is doubted: sensors are off by
+some percent, friction of an arm by more."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,13 @@ def account_of(read: Readings | None, log: Log) -> Account:
         )
         remedy = "check stiffness, plane and units, and which columns are mapped"
         return account + Account((), (doubt("convention", told, remedy, serious=True),))
+    if max(own.left.values(), default=0.0) > LEFT_OVER:
+        told = (
+            f"K (x - u) leaves {_left(own)} unexplained over {rows} rows: friction of the arm, a"
+            " stiffness that is another, a gain, a drift, or a channel that saturates"
+        )
+        remedy = "look at the panels against K (x - u), and run scripts/check.py --stiffness"
+        account += Account((), (doubt("parity", told, remedy),))
     if own.depth < WITHIN:
         told = (
             "forces would act from within the object: by their torques the hand lies beyond the"

@@ -215,8 +215,9 @@ def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
     if len(settled.rows) > 1 or (settled.commands is None and len(settled.rows)):
         return
     window = choices.stillness.window
-    if settled.commands is None and not settled.broken:
-        each = float(np.median(np.diff(log.times)))
+    each = float(np.median(np.diff(log.times)))
+    rare = 2 * BLOCKS * each > window
+    if not settled.broken and (settled.commands is None or (settled.brief and rare)):
         raise LogError(
             log.path,
             f"no {window:g} s hold the {2 * BLOCKS} samples of a row: they come every {each:.3g} s",

@@ -132,6 +132,10 @@ def find_layout(lines: Sequence[str], more: Sequence[str] = ()) -> Layout:
         names = headers[last - 1]
     first = last + 1
     table = [row for row in [*cells[first:], *(split(line, separator) for line in more)]]
+    if not names[-1] and any(len(row) == count and row[-1] for row in table):
+        raise ValueError(
+            f"line {first} has {count - 1} names, the rows below it have {count} cells"
+        )
     numbers = [cell for row in table for cell in row if cell]
     commas = sum("," in cell and COMMA_NUMBER.fullmatch(cell) is not None for cell in numbers)
     points = sum("." in cell and NUMBER.fullmatch(cell) is not None for cell in numbers)

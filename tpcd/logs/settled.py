@@ -59,7 +59,7 @@ class Settled:
     unsettled: tuple[float, ...]
     """Times at which holds ended that were left out because the arm still moved [s]."""
     brief: int
-    """Holds too short for a row."""
+    """Holds too short for a row, or with too few samples in it."""
     broken: tuple[float, ...] = ()
     """Times at which stretches ended that findings leave out, in whole or in part [s]."""
 

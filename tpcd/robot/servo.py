@@ -55,6 +55,10 @@ GENTLE = 2.5
 """An oscillation of more than so many times what counts as one ends the run at once."""
 PROGRESS = 0.01
 """Share of the command's way whose time is limited, while the arm follows."""
+FROZEN = 0.1
+"""A wrench that repeats exactly for so long is of a sensor that has stopped [s]."""
+NOISY = 1e-3
+"""Whose readings have at least this noise [N]; one without may rest."""
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -83,7 +87,8 @@ class Servo:
         """Where the arm is sent; None while it is only read."""
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
-        self._over, self._slower = 0, 0
+        self._over, self._slower, self._repeated = 0, 0, 0
+        self._last_wrench: np.ndarray | None = None
         self._retreating: int | None = None
         """Thread that makes the arm retreat."""
         self._felt: deque[np.ndarray] = deque(maxlen=max(1, round(RECENT * link.rate)))
@@ -96,6 +101,7 @@ class Servo:
         self._signals.look()
         frame, state = self.frame, self.state
         sample = self.link.next_sample()
+        self._check_alive(sample)
         pose, wrench = planar_pose(frame, sample.tcp), planar_wrench(frame, sample.wrench)
         reference = pose if state is None else state.reference
         # What cannot be kept ends a move, and no retreat.
@@ -118,6 +124,23 @@ class Servo:
             )
         self.check_inside("the arm", pose, MARGIN)
         return sample, pose, wrench
+
+    def _check_alive(self, sample: Sample) -> None:
+        """Raises RobotError for readings that are no numbers, and for a wrench that has frozen."""
+        if not (np.isfinite(sample.tcp).all() and np.isfinite(sample.wrench).all()):
+            raise RobotError(
+                f"a reading that is no number: pose {sample.tcp.tolist()}, wrench"
+                f" {sample.wrench.tolist()}"
+            )
+        same = self._last_wrench is not None and np.array_equal(sample.wrench, self._last_wrench)
+        self._repeated = self._repeated + 1 if same else 0
+        self._last_wrench = np.array(sample.wrench)
+        frozen = self._repeated > FROZEN * self.link.rate and float(self.noise[:2].min()) > NOISY
+        if frozen and not self._retreating:
+            raise RobotError(
+                f"the force sensor repeats {self._last_wrench[:3].tolist()} N exactly, where single"
+                f" readings scatter by {self.noise[:2].max():.2g} N: it has stopped"
+            )
 
     def stand(self, seconds: float) -> FreeAir:
         """Readings of an arm that is not moved."""
@@ -241,7 +264,8 @@ class Servo:
         low, high = (
             np.array(v) for v in (self.settings.workspace_low, self.settings.workspace_high)
         )
-        if bool((pose < low - margin).any() or (pose > high + margin).any()):
+        # A NaN is inside of nothing.
+        if not bool((pose >= low - margin).all() and (pose <= high + margin).all()):
             shown = ", ".join(f"{value:.3f}" for value in pose)
             raise RobotError(
                 f"{what} is at ({shown}) [m, m, rad], outside of the workspace from"

@@ -104,6 +104,8 @@ class UniversalRobot:
         Raises RobotError for a command outside of the workspace, and where the arm had to stop.
         """
         target = command.detach().double().numpy()
+        if target.shape != (3,):
+            raise ValueError(f"command has shape {target.shape}, expected 3 numbers")
         servo = self._require_servo()
         servo.check_inside("a command", target)
         self._guard.row += 1

@@ -25,6 +25,7 @@ MESH_ENDINGS = (".ply", ".stl", ".obj")
 STL_HEADER, STL_TRIANGLE = 84, 50
 """Bytes of a binary STL: what comes first, the number of triangles at its end, and a triangle."""
 DECIMAL_COMMA = re.compile(r"^\s*(?:v|vertex)\s+[-+\d.]*\d,\d", re.MULTILINE)
+ZERO_INDEX = re.compile(r"^f[ \t][^\n]*?[ \t]0(?=[/\s])", re.MULTILINE)
 FINEST = 1e-3
 """Largest step between stored numbers, in sizes of the object."""
 EXPORT = "export it again"
@@ -85,6 +86,9 @@ def _content(path: Path, ending: str) -> bytes:
     if comma := DECIMAL_COMMA.search(text):
         line = text.count("\n", 0, comma.end()) + 1
         raise OutlineError(path, f"line {line} has a decimal comma", f"{EXPORT} with points")
+    if ending == ".obj" and (zero := ZERO_INDEX.search(text)):
+        line = text.count("\n", 0, zero.end()) + 1
+        raise OutlineError(path, f"line {line} counts vertices from 0", "an OBJ counts from 1")
     if ending == ".stl" and text.count("endfacet") != text.count("facet") - text.count("endfacet"):
         raise OutlineError(path, "is cut off within a triangle", EXPORT)
     return text.encode()

@@ -21,7 +21,8 @@ from tpcd.text import encoding_of, lines_of, read_text
 
 SEPARATOR = re.compile(r"[,;\t ]+")
 WIDE_SEPARATOR = re.compile(r"[;\t ]+")
-DECIMAL_COMMA = re.compile(r"[-+]?\d*,?\d+([eE][-+]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
+HEADER_UNIT = re.compile(r"[\[(]\s*(m|cm|mm|in)\s*[\])]")
 
 
 def load_outlines(
@@ -42,13 +43,13 @@ def load_outlines(
     ending = path.suffix.lower()
     if ending == ".svg":
         return load_svg(path, unit=unit)
-    unit = "m" if unit is None else unit
-    if unit not in METRES_PER_UNIT:
+    if unit not in (None, *METRES_PER_UNIT):
         raise ValueError(f"unit must be one of {', '.join(METRES_PER_UNIT)}, got {unit!r}")
-    if ending == ".npz":
-        return load_slices(path, unit=unit)
     if ending == ".csv":
         return {path.stem: load_polygon(path, unit=unit)}
+    unit = unit or "m"
+    if ending == ".npz":
+        return load_slices(path, unit=unit)
     if ending in MESH_ENDINGS:
         return {path.stem: cut_mesh(load_mesh(path, unit=unit), path.stem, plane, path=path)}
     known = ", ".join((".npz", ".csv", ".svg", *MESH_ENDINGS))
@@ -87,10 +88,11 @@ def load_slices(path: str | Path, *, unit: str = "m") -> dict[str, Outline]:
     return outlines
 
 
-def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
+def load_polygon(path: str | Path, *, unit: str | None = None) -> Outline:
     """The polygon of a `.csv` file: one vertex `x, z` per row, named after the file.
 
     A first row without numbers is a header; empty rows and rows that start with # are skipped.
+    A header may name the unit, `x [mm], z [mm]`; without `unit` or that, metres are assumed.
     Numbers may have decimal commas where something else parts them (`0,03; 0,02`).
 
     Raises:
@@ -107,7 +109,7 @@ def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
     except (OSError, ValueError) as error:
         raise OutlineError(path, f"not readable as text ({error})", "give x, z rows") from None
     points: list[list[float]] = []
-    header_seen = False
+    header_seen, units = False, set[str]()
     for number, line in enumerate(lines_of(text), start=1):
         fields = _fields(line)
         if not fields or fields[0].startswith("#"):
@@ -115,11 +117,16 @@ def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
         try:
             row = [float(field) for field in fields]
         except ValueError:
-            if points or header_seen:
+            broken = any(field.lstrip("+-\u2212.")[:1].isdigit() for field in fields)
+            if points or header_seen or broken:
                 raise OutlineError(
                     path, f"line {number} is '{line.strip()[:40]}'", "expected two numbers x, z"
                 ) from None
             header_seen = True
+            units |= set(HEADER_UNIT.findall(line))
+            if [field.strip('"').lower()[:1] for field in fields[:1]] in (["z"], ["y"]):
+                told = f"line {number} begins with {fields[0]}"
+                raise OutlineError(path, told, "expected x, z") from None
             continue
         if len(row) != 2:
             expected = "expected x, z"
@@ -129,6 +136,10 @@ def load_polygon(path: str | Path, *, unit: str = "m") -> Outline:
         points.append(row)
     if not points:
         raise OutlineError(path, "holds no vertices", "expected one x, z row for each")
+    if units and (len(units) > 1 or unit not in (None, *units)):
+        told = f"its header is in {' and '.join(sorted(units))}"
+        raise OutlineError(path, told, f"expected one unit{f', {unit}' if unit else ''}")
+    unit = unit or (units.pop() if units else "m")
     scaled = np.array(points) * METRES_PER_UNIT[unit]
     return make_outline(path.stem, scaled, path=path, source=path.name)
 

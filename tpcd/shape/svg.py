@@ -41,7 +41,9 @@ LENGTH = re.compile(rf"\s*({NUMBER.pattern})\s*([a-zA-Z%]*)\s*$")
 TRANSFORM = re.compile(r"\s*,?\s*([a-zA-Z]+)\s*\(([^)]*)\)")
 SHAPES = ("path", "polygon", "polyline", "rect", "circle", "ellipse")
 HIDDEN = re.compile(r"display\s*:\s*none|visibility\s*:\s*(hidden|collapse)")
-STYLED = re.compile(HIDDEN.pattern + r"|(?<![\w-])(transform|width|height|r|rx|ry|x|y|cx|cy|d)\s*:")
+STYLED = re.compile(
+    r"(?<![\w-])(transform|scale|rotate|translate|width|height|r|rx|ry|x|y|cx|cy|d)\s*:", re.I
+)
 """What a style sheet says that would change which shapes there are, or where."""
 NOT_DRAWN = ("defs", "clipPath", "mask", "symbol", "pattern", "marker", "metadata")
 
@@ -70,6 +72,7 @@ def load_svg(
     if _tag(root) != "svg":
         raise OutlineError(path, f"its root element is <{_tag(root)}>", "expected <svg>")
     try:
+        _check_styles(root, unit)
         matrix = _user_to_metres(root, unit)
         shapes = list(_shapes(root, matrix))
     except ValueError as error:
@@ -103,6 +106,27 @@ def _has_area(loop: np.ndarray) -> bool:
 
 def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
+def _check_styles(root: ElementTree.Element, unit: str | None) -> None:
+    """Refuse what would make other shapes of those that are read: styles, clips and masks, and
+    lengths with a unit of their own beside a `unit` of the drawing."""
+    for element in root.iter():
+        style = element.get("style", "")
+        sheet = (element.text or "") if _tag(element) == "style" else ""
+        if STYLED.search(HIDDEN.sub("", style)) or STYLED.search(sheet) or HIDDEN.search(sheet):
+            raise ValueError(
+                "a style hides, moves or sizes shapes; export it as plain SVG (presentation"
+                " attributes)"
+            )
+        if element.get("clip-path", "none") != "none" or element.get("mask", "none") != "none":
+            raise ValueError("a shape is clipped or masked; apply that before exporting")
+        sized = unit not in (None, "px") and _tag(element) in SHAPES
+        for key in ("x", "y", "width", "height", "r", "rx", "ry", "cx", "cy") if sized else ():
+            length = LENGTH.match(element.get(key, ""))
+            if length and length[2] not in ("", "px"):
+                told = f"{key}='{element.get(key)}' has a unit of its own"
+                raise ValueError(f"{told}; give --unit px, which keeps it")
 
 
 def _outer_loop(path: Path, name: str, loops: list[np.ndarray]) -> np.ndarray:
@@ -197,10 +221,6 @@ def _shapes(
         return
     if tag == "use":
         raise ValueError("it holds a <use> clone; turn clones into paths before exporting")
-    if "transform:" in style or (tag == "style" and STYLED.search(element.text or "")):
-        raise ValueError(
-            "a style hides, moves or sizes shapes; export it as plain SVG (presentation attributes)"
-        )
     if around is None:  # the root
         view = [float(value) for value in NUMBER.findall(element.get("viewBox", ""))]
         around = (view[2], view[3]) if len(view) == 4 else (math.nan, math.nan)

@@ -1,0 +1,79 @@
+"""Readings and commands that are no numbers, and a sensor that has stopped, move no arm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from robot_bench import wired_arm
+
+from tpcd.errors import RobotError
+
+NAN = float("nan")
+
+
+def started(folder: Path) -> tuple[Any, Any, torch.Tensor]:
+    arm, controller = wired_arm(folder)
+    return arm, controller, arm.start().poses[0].clone()
+
+
+def altered(arm: Any, change: Any) -> None:
+    """Let every reading of the link go through `change(count, sample)`."""
+    link, count = arm._link, [0]
+    original = link.next_sample
+
+    def changed() -> Any:
+        count[0] += 1
+        return change(count[0], original())
+
+    link.next_sample = changed
+
+
+def test_a_wrench_that_has_stopped_stops_the_arm_before_it_presses(tmp_path: Path) -> None:
+    arm, controller, start = started(tmp_path)
+    first: list[np.ndarray] = []
+
+    def frozen(_: int, sample: Any) -> Any:
+        first.append(sample.wrench)
+        return replace(sample, wrench=first[0])
+
+    altered(arm, frozen)
+    with pytest.raises(RobotError, match="the force sensor repeats .* it has stopped"):
+        arm.settle(start - torch.tensor([0.0, 0.06, 0.0], dtype=torch.float64))
+    assert arm.at_rest is not None
+    assert abs(controller._load[:2]).max() < 2.0
+
+
+@pytest.mark.parametrize("channel", ["wrench", "tcp"])
+def test_one_reading_that_is_no_number_ends_a_move_in_a_retreat(
+    tmp_path: Path, channel: str
+) -> None:
+    arm, controller, start = started(tmp_path)
+    command = start - torch.tensor([0.0, 0.08, 0.0], dtype=torch.float64)
+    arm.settle(command)
+    pressed = abs(controller._load[:2]).max()
+
+    def once(count: int, sample: Any) -> Any:
+        return replace(sample, **{channel: np.full(6, NAN)}) if count == 10 else sample
+
+    altered(arm, once)
+    with pytest.raises(RobotError, match="a reading that is no number.*retreated"):
+        arm.settle(command)
+    assert pressed > 1.0 and abs(controller._load[:2]).max() < 0.5
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_command_that_is_no_number_is_refused_before_anything_moves(
+    tmp_path: Path, place: int
+) -> None:
+    arm, _, start = started(tmp_path)
+    sent: list[np.ndarray] = []
+    arm._link.servo = sent.append
+    start[place] = NAN
+    with pytest.raises(RobotError, match="outside of the workspace"):
+        arm.settle(start)
+    assert sent == [] and arm.at_rest is None

@@ -194,13 +194,14 @@ def simulate(config: Simulation) -> None:
         for episode, stem in enumerate(config.out / name for name in names):
             generator = stream(config.seed, EPISODE_STREAM, episode, *config.policy.encode())
             motion = make_motion(config.policy, scene, config.steps, generator)
-            recording = record(
-                truth, scene, motion, config.steps, generator, sensor_std, notes=notes
-            )
             try:
+                recording = record(
+                    truth, scene, motion, config.steps, generator, sensor_std, notes=notes
+                )
                 contents.update(recording_contents(recording, scene, stem, config.format, made_by))
-            except EpisodeError as error:
-                raise ValueError(config.blamed(error.problem)) from error
+            except (EpisodeError, ValueError) as error:
+                problem = error.problem if isinstance(error, EpisodeError) else str(error)
+                raise ValueError(config.blamed(problem)) from error
             reach = [scene.clearances(pose) for pose in recording.true.poses[1:]]
             lines.append(
                 f"{stem}.{config.format}: {config.steps} steps,"

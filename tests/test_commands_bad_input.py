@@ -243,10 +243,6 @@ SIMULATE = {
     "unknown effect": ({"--effects": "foo.bar=1"}, "no effect 'foo'"),
     "unit of a name": ({"--unit": "mm"}, "unit is 'mm', expected none for 'mug', which is no file"),
     "file in the way": ({"--out": "cross.csv"}, "is a file"),
-    "start turned by half": (
-        {"--start": "0 0.3 3.1"},
-        "simulate: error: --start makes an episode that cannot be, row 1 (line 3), column u_phi",
-    ),
     "scale of a house": ({"--scale": "1000"}, "error: --scale makes an episode that cannot be"),
     "force noise in mN": (
         {"--noise-force": "1e9"},

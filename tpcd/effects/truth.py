@@ -92,6 +92,7 @@ class EffectTruth:
             TRUE_PASSES if self._added.passes else 0,
         )
         pose = found.transition.pose[0, -1]
-        settled = bool(found.transition.status[0, -1] == int(StepStatus.CONVERGED))
+        # A floor that moves between two rows may reach above where the object was.
+        settled = bool(found.transition.status[0, -1] <= int(StepStatus.START_INSIDE))
         self._poses = torch.cat((self._poses, pose[None]))
         return pose, found.wrench[0, -1], settled

@@ -87,8 +87,8 @@ def test_a_missing_engine_says_how_to_get_it(monkeypatch):
     def find_nothing(name: str) -> None:
         return None
 
-    for module in ("tpcd.qp.solve", "tpcd.qp.qpth_engine"):
-        monkeypatch.setattr(import_module(module), "find_spec", find_nothing)
+    monkeypatch.setattr(import_module("tpcd.qp.qpth_engine"), "find_spec", find_nothing)
+    monkeypatch.setattr(import_module("tpcd.qp.solve"), "available", lambda: False)
     with pytest.raises(SolverError, match=r"tpcd\[qpth\]"):
         solve(problem(), engine="qpth")
     with pytest.raises(SolverError, match=r"tpcd\[fast\]"):

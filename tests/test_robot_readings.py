@@ -45,7 +45,7 @@ def test_a_wrench_that_has_stopped_stops_the_arm_before_it_presses(tmp_path: Pat
     with pytest.raises(RobotError, match="the force sensor repeats .* it has stopped"):
         arm.settle(start - torch.tensor([0.0, 0.06, 0.0], dtype=torch.float64))
     assert arm.at_rest is not None
-    assert abs(controller._load[:2]).max() < 2.0
+    assert abs(controller._load[:3]).max() < 2.0
 
 
 @pytest.mark.parametrize("channel", ["wrench", "tcp"])
@@ -55,7 +55,7 @@ def test_one_reading_that_is_no_number_ends_a_move_in_a_retreat(
     arm, controller, start = started(tmp_path)
     command = start - torch.tensor([0.0, 0.08, 0.0], dtype=torch.float64)
     arm.settle(command)
-    pressed = abs(controller._load[:2]).max()
+    pressed = abs(controller._load[:3]).max()
 
     def once(count: int, sample: Any) -> Any:
         return replace(sample, **{channel: np.full(6, NAN)}) if count == 10 else sample
@@ -63,7 +63,7 @@ def test_one_reading_that_is_no_number_ends_a_move_in_a_retreat(
     altered(arm, once)
     with pytest.raises(RobotError, match="a reading that is no number.*retreated"):
         arm.settle(command)
-    assert pressed > 1.0 and abs(controller._load[:2]).max() < 0.5
+    assert pressed > 1.0 and abs(controller._load[:3]).max() < 0.5
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])

@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tpcd.cli import run as run_command
 from tpcd.errors import RunError
-from tpcd.results import open_run
+from tpcd.results import run_folder
 from training.config import DataConfig, LayoutConfig, NetworkConfig, OptimConfig
 from training.data import Batch, Batches, Prepared, prepare
 from training.fitting import fit
@@ -245,7 +245,8 @@ def test_other_steps_ahead_are_no_resuming(
     prepared: Prepared, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str
 ) -> None:
     out = tmp_path / "run"
-    open_run(out, "train", replace(CONFIG, out=out))
+    with run_folder(out, "train", replace(CONFIG, out=out)):
+        pass
     (out / CHECKPOINT).write_bytes(b"")
     torch.save({ENTRY: {"format_version": 1, **vars(Kept())}, "state_dict": {}}, out / CHECKPOINT)
     before = (out / "config.yaml").read_text()

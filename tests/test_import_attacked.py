@@ -1,0 +1,61 @@
+"""Tables and readings that fresh eyes found to be believed or refused for a wrong reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_logs import Setting, an_episode, in_space, sampled, write_csv
+
+from tpcd.logs.columns import log_from_columns
+from tpcd.logs.importing import Importing, import_log
+from tpcd.logs.log import LogError
+from tpcd.logs.table import read_columns
+
+MAP = ["time=t", "pose=p", "wrench=w", "command=u"]
+STIFFNESS = (100.0, 100.0, 50.0)
+
+
+def table(gain: float = 1.0) -> dict[str, np.ndarray]:
+    space = in_space(sampled(an_episode(12)), Setting())
+    columns = {"t": space["time"]}
+    blocks = {"p": ("position", "rotation"), "w": ("force", "torque"), "u": ("target", "turned")}
+    for name, parts in blocks.items():
+        values = np.column_stack([space[part] for part in parts])
+        columns.update({f"{name}_{k}": values[:, k] for k in range(values.shape[1])})
+    for k in range(3):
+        columns[f"w_{k}"] = gain * columns[f"w_{k}"]
+    return columns
+
+
+def imported(path: Path, columns: dict[str, np.ndarray]):
+    write_csv(path, columns)
+    return import_log(log_from_columns(read_columns(path), MAP, path), Importing(STIFFNESS))
+
+
+def test_a_table_whose_time_runs_backwards_is_told_to_be_sorted(tmp_path: Path) -> None:
+    backwards = {name: values[::-1] for name, values in table().items()}
+    with pytest.raises(LogError, match="time runs backwards from row to row; sort the rows"):
+        imported(tmp_path / "run.csv", backwards)
+
+
+def test_a_line_of_names_that_is_one_short_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("a,b,c\n" + "".join(f"{k},{k},{k},{k}\n" for k in range(9)))
+    with pytest.raises(LogError, match="3 names, the rows below it have 4 cells"):
+        read_columns(path)
+
+
+def test_samples_too_rare_for_a_row_are_named_and_not_the_holds(tmp_path: Path) -> None:
+    rare = {name: values[::10] for name, values in table().items()}
+    with pytest.raises(LogError, match="no 0.5 s hold the 8 samples of a row: they come every"):
+        imported(tmp_path / "run.csv", rare)
+
+
+@pytest.mark.parametrize(("gain", "told"), [(1.0, False), (1.3, True)])
+def test_forces_that_are_not_the_springs_are_doubted(
+    tmp_path: Path, gain: float, told: bool
+) -> None:
+    doubts = imported(tmp_path / "run.csv", table(gain)).account.doubts
+    assert any(each.kind in ("parity", "convention") for each in doubts) == told

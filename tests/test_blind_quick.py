@@ -8,12 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from eval.blind.__main__ import TUNING_SEED
 from eval.blind.sealing import key_path
 
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_three_hidden_cases_are_named_before_their_keys_are_opened(tmp_path: Path) -> None:
     out = tmp_path / "blind"
     command = [sys.executable, "-m", "eval.blind", "--quick", "--prior", "ycb-rich-holdout"]

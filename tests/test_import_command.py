@@ -70,7 +70,6 @@ def test_springs_that_look_like_another_unit_are_taken_when_insisted_on(
     assert episode.unusual and episode.stiffness.tolist() == [5.0, 5.0, 5.0]
 
 
-
 def test_a_recording_becomes_an_episode(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

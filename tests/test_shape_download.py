@@ -349,7 +349,7 @@ def test_meshes_without_an_outline_are_reported(tmp_path):
     (tmp_path / "meshes" / "good.ply").write_bytes(crate())
     (tmp_path / "meshes" / "bad.ply").write_bytes(b"garbage")
     problems = write_slices(tmp_path)
-    assert list(problems) == ["bad"] and "not readable as a mesh" in problems["bad"]
+    assert list(problems) == ["bad"] and "does not begin with 'ply'" in problems["bad"]
     with np.load(tmp_path / "slices.npz") as arrays:
         np.testing.assert_allclose(np.ptp(arrays["good"], axis=0), [0.16, 0.21], atol=1e-6)
     with np.load(tmp_path / "slices_extra.npz") as arrays:

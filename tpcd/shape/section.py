@@ -112,7 +112,11 @@ def cut_mesh(
             mesh, or it is no outline of plausible size.
     """
     blame = path if path is not None else f"mesh '{name}'"
-    loops = _loops(mesh, plane if plane is not None else upright_plane(mesh), blame)
+    try:
+        plane = plane if plane is not None else upright_plane(mesh)
+    except ValueError as error:
+        raise OutlineError(blame, str(error)) from None
+    loops = _loops(mesh, plane, blame)
     largest = max(loops, key=lambda loop: loop.area)
     pieces = [p for p in loops if p is not largest and not largest.contains(p)]
     extra = sum(p.area for p in pieces) / largest.area

@@ -91,7 +91,7 @@ class Simulation:
     """Effects that the truth has besides, as `floor_compliance.compliance=2e-4`, in SI units."""
     start: tuple[float, ...] = ()
     """Start pose x z phi instead of one 10 to 20 mm above the floor [m, m, rad]."""
-    unit: Literal["m", "cm", "mm", "in", "px"] | None = None
+    unit: Literal["m", "cm", "mm", "in", "pt", "px"] | None = None
     """Unit of the outline file's coordinates instead of metres, or of what an SVG says."""
     format: Literal["csv", "parquet"] = "csv"
     """Format of the episode's table."""

@@ -254,7 +254,8 @@ def test_lines_beside_a_shape_are_left_out_and_told(tmp_path):
         "<style>rect{width:60px}</style><rect width='6' height='9'/>",
         "<rect style='transform: scale(2)' width='60' height='90'/>",
         "<rect style='scale:.5' width='60' height='90'/>",
-        "<circle style='r:20px' r='10'/>",
+        "<path style='d:path(\"M0 0H60V90Z\")' d='M0 0H6V9Z'/>",
+        "<style>.a{clip-path:url(#c)}</style><rect class='a' width='60' height='90'/>",
         "<defs><style>.a{transform:scale(.5)}</style></defs><rect width='60' height='90'/>",
     ],
 )
@@ -263,9 +264,63 @@ def test_styles_that_change_shapes_are_refused(tmp_path, body):
 
 
 @pytest.mark.parametrize("attribute", ["clip-path", "mask"])
-def test_what_is_clipped_is_refused(tmp_path, attribute):
-    body = f"<rect {attribute}='url(#c)' width='60' height='90'/>"
+@pytest.mark.parametrize("given", ["{}='url(#c)'", "style='{}:url(#c)'"])
+def test_what_is_clipped_is_refused(tmp_path, attribute, given):
+    body = f"<rect {given.format(attribute)} width='60' height='90'/>"
     assert "clipped or masked" in refusal(drawing(tmp_path, body))
+    assert single(tmp_path, f"<defs>{body}</defs><rect width='60' height='90'/>").area
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "<g visibility='hidden'><rect visibility='visible' width='60' height='90'/></g>",
+        "<g style='visibility:hidden'><g style='visibility : visible'>"
+        "<rect visibility='inherit' width='60' height='90'/></g><circle r='9'/></g>",
+        "<rect display='none' style='display:inline' width='60' height='90'/>",
+        "<rect display=' none ' width='9' height='9'/><rect width='60' height='90'/>",
+        "<g transform='scale(1 .26458333)'>"
+        "<rect style='width:60px;height:9cm !important' height='1'/></g>",
+        "<rect width='30%' height='90%' x='10%'/>",
+        "<style>/* width: of lines */.a{fill:red}</style><rect width='60' height='90'/>",
+        "<rect width='60' height='90' rx='auto'/><line x2='9'/><polyline points='0 0 9 9'/>",
+    ],
+)
+def test_a_style_goes_before_attributes_and_visibility_is_inherited(tmp_path, body):
+    assert single(tmp_path, body).area == pytest.approx(0.0054)
+
+
+@pytest.mark.parametrize(
+    "root",
+    [
+        'style="width:200mm;height:100mm" viewBox="0 0 200 100"',
+        'width="9mm" style="width: 20cm ;height:100mm !important" viewBox="0 0 200 100"',
+        'width="200MM" height="10Cm" viewBox="0,0,200,100"',
+        'width="800Q" height="400Q" viewBox="0 0 200 100"',
+    ],
+)
+def test_the_size_of_a_drawing_is_read_in_every_spelling(tmp_path, root):
+    assert single(tmp_path, '<rect width="60" height="90"/>', root).area == pytest.approx(0.0054)
+
+
+def test_percent_of_a_radius_are_of_the_diagonal(tmp_path):
+    outline = single(tmp_path, '<circle cx="50%" cy="50%" r="10%"/>')
+    assert outline.size[0] == pytest.approx(0.2 * np.hypot(0.2, 0.1) / np.sqrt(2), rel=1e-3)
+    assert single(tmp_path, '<ellipse rx="30"/>').size == pytest.approx((0.06, 0.06), rel=1e-3)
+
+
+def test_pixels_of_other_programs_are_not_those_of_css(tmp_path):
+    """170.079 pt are 60 mm; Illustrator and Inkscape before 0.92 wrote pixels of their own."""
+    body = '<rect width="170.079" height="255.118"/>'
+    path = drawing(tmp_path, "<!-- Generator: Adobe Illustrator 27 -->" + body, "")
+    assert "its pixels are 1/72 inch; give --unit pt" in refusal(path, unit="px")
+    (outline,) = load_svg(path, unit="pt").values()
+    assert outline.area == pytest.approx(0.0054, rel=1e-5)
+    space = 'xmlns:inkscape="http://www.inkscape.org/namespaces/inkscape" inkscape:version='
+    assert single(tmp_path, body, f'{space}"0.92.4"', unit="px").size[0] < 0.06
+    assert "1/90 inch" in refusal(drawing(tmp_path, body, f'{space}"0.91 r1"'), unit="px")
+    whole = f'{space}"0.91 r1" width="200mm" height="100mm" viewBox="0 0 566.929 283.465"'
+    assert single(tmp_path, body, whole).area == pytest.approx(0.0054, rel=1e-5)
 
 
 def test_lengths_with_units_keep_them_or_are_refused(tmp_path):
@@ -322,8 +377,11 @@ def test_the_unit_comes_from_the_caller_or_from_the_root(tmp_path, root, unit, w
         ('<path id="p" d="M0 0L5 X"/>', MM, "<path id='p'>: path data lacks a number"),
         ('<path d="M0 0H50V50Z M60 0H80V20Z"/>', MM, "several separate pieces"),
         ('<path d="M0 0L50 50H0L50 0Z"/>', MM, "crosses or touches itself"),
-        ('<path d="M0 0L50 50"/>', MM, "2 distinct vertices"),
-        ('<polygon points="0 0 1 1"/>', MM, "'points' holds 4 numbers"),
+        ('<path d="M0 0L50 50"/><line x2="5"/>', MM, "2 lines without an area; join the lines"),
+        ('<polygon points="0 0 1 1 2"/>', MM, "'points' holds 5 numbers"),
+        ('<polygon points="0 0 60mm 0 5 5"/>', MM, "holds 'mm'; expected numbers alone"),
+        ('<rect width="-60" height="9"/>', MM, "width='-60' is negative"),
+        ('<circle r="5" transform="scale(200%)"/>', MM, "'200%' holds '%'"),
         ('<use href="#a"/>', MM, "clone"),
         ('<circle r="half"/>', MM, "r='half' is no length"),
         ('<circle r="5" transform="wobble(3)"/>', MM, "transform 'wobble'"),

@@ -211,6 +211,13 @@ def test_what_is_no_outline_is_refused_with_its_cause(vertices, expected):
     assert expected in refusal(vertices)
 
 
+@pytest.mark.parametrize("after", [SQUARE, SQUARE / 2 + 0.02, SQUARE[::-1] + 0.2])
+def test_vertices_that_follow_a_closed_curve_are_refused(after):
+    assert "is closed by vertex 4, and 4 follow" in refusal(
+        [*SQUARE, SQUARE[0], *after[:3], [1, 0]]
+    )
+
+
 def test_the_file_to_blame_stands_first():
     assert refusal(SQUARE[:2], path="shapes.npz").startswith("shapes.npz: outline 'thing' ")
 

@@ -66,6 +66,9 @@ def test_units_are_turned_into_metres(tmp_path, unit, factor, ending):
         "0 0\n0,06 0\n0,06 0,09\n0 0,09\n",
         "0, 0\n0.06, 0\n0.06, 0.09\n0, 0.09\n",
         "0,0,\n0.06,0,\n0.06,0.09,\n0,0.09,\n",
+        '"x","z"\n"0","0"\n"0.06","0"\n"0.06","0.09"\n"0","0.09"\n',
+        '"0,0","0,0"\n"0,06","0,0"\n"0,06","0,09"\n"0,0","0,09"\n',
+        "'0';'0'\n'0,06';'0'\n'0,06';'0,09'\n'0';'0,09'\n",
     ],
 )
 def test_decimal_commas_are_read_where_something_else_parts_the_numbers(tmp_path, rows):
@@ -83,6 +86,28 @@ def test_the_unit_of_a_header_is_taken_unless_another_is_given(tmp_path):
     assert load_outlines(path)["plate"].area == pytest.approx(0.0054)
     with pytest.raises(OutlineError, match="its header is in mm; expected one unit, cm"):
         load_outlines(path, unit="cm")
+
+
+@pytest.mark.parametrize(
+    ("header", "scale"),
+    [
+        ("x_mm,z_mm", 1000),
+        ("X (MM);Z (MM)", 1000),
+        ("x/cm\tz/cm", 100),
+        ("x, z in mm", 1000),
+        ("x,z\nmm,mm", 1000),
+        ('"x","z"\n"[in]","[in]"', 1 / 0.0254),
+        ("x [inch],z [inch]", 1 / 0.0254),
+        ("# unit: mm\nx,z", 1000),
+        ("# a plate, cut from 3 mm steel\nx,z", 1),
+        ("width in front,height in front", 1),
+    ],
+)
+def test_a_header_names_its_unit_in_many_ways(tmp_path, header, scale):
+    corners = [(0, 0), (0.06, 0), (0.06, 0.09), (0, 0.09)]
+    rows = "".join(f"{x * scale},{z * scale}\n" for x, z in corners)
+    outline = load_outlines(write(tmp_path / "plate.csv", f"{header}\n{rows}"))["plate"]
+    assert outline.area == pytest.approx(0.0054)
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
@@ -111,6 +136,8 @@ def test_a_csv_in_millimetres_without_saying_so_gets_the_hint(tmp_path):
         ("\u22120.1,0\n0.1,0\n0.1,0.1\n", "line 1 is"),
         ("z,x\n0,0\n0.1,0\n0.1,0.1\n", "line 1 begins with z"),
         ("x [mm],z [cm]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in cm and mm"),
+        ("x [ft],z [ft]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in ft"),
+        ("0,0\n0.1,0\n0.1,0.1\n\n0.2,0\n0.3,0\n0.3,0.1\n", "line 4 is empty and parts"),
         ("0,0\n0.1\n0.1,0.1\n", "line 2 has 1 numbers"),
         ("0,0\n0.1,nan\n0.1,0.1\n", "vertex 1 is (0.1, nan)"),
         ("0,0\n0.1,0.1\n0.1,0\n0,0.1\n", "crosses or touches itself at (0.05, 0.05) m"),

@@ -90,6 +90,7 @@ def make_outline(
     blame = path if path is not None else f"outline '{name}'"
     where = f"outline '{name}' " if path is not None else ""
     points = _finite_points(vertices, blame, where)
+    _check_once_round(points, blame, where)
     points = _without_repeats(points)
     if len(points) < 3:
         raise OutlineError(
@@ -215,6 +216,17 @@ def _finite_points(vertices: object, blame: str | Path, where: str) -> np.ndarra
             "every coordinate must be finite",
         )
     return points
+
+
+def _check_once_round(points: np.ndarray, blame: str | Path, where: str) -> None:
+    """Refuse vertices that go on after the first one has come again: another outline, a hole."""
+    away = np.abs(points - points[:1]).max(axis=1) > SMALLEST_EDGE
+    left = np.flatnonzero(away)
+    back = np.flatnonzero(~away)
+    back = back[back > max(2, left[0])] if len(left) else left
+    if len(back) and back[0] < left[-1]:
+        closed = f"{where}is closed by vertex {back[0]}, and {len(points) - 1 - back[0]} follow"
+        raise OutlineError(blame, closed, "give one simple closed curve")
 
 
 def _without_repeats(points: np.ndarray) -> np.ndarray:

@@ -22,7 +22,13 @@ from tpcd.text import encoding_of, lines_of, read_text
 SEPARATOR = re.compile(r"[,;\t ]+")
 WIDE_SEPARATOR = re.compile(r"[;\t ]+")
 DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
-HEADER_UNIT = re.compile(r"[\[(]\s*(m|cm|mm|in)\s*[\])]")
+QUOTED = re.compile(r"""(["'])(.*?)\1""")
+UNITS = r"(m|cm|mm|in|inch|inches|dm|ft|um|\u00b5m|px|pt)"
+HEADER_UNIT = re.compile(
+    rf"[\[(_/]\s*{UNITS}(?![a-z])|(?:^|[,;\t])\s*{UNITS}\s*(?=$|[,;\t])|\b(cm|mm|inch|inches)\b"
+)
+"""A unit in brackets, after a line or a stroke, alone in its cell, or one that is no word."""
+COMMENT_UNIT = re.compile(rf"\bunits?\s*[:=]?\s*{UNITS}\b")
 
 
 def load_outlines(
@@ -91,9 +97,10 @@ def load_slices(path: str | Path, *, unit: str = "m") -> dict[str, Outline]:
 def load_polygon(path: str | Path, *, unit: str | None = None) -> Outline:
     """The polygon of a `.csv` file: one vertex `x, z` per row, named after the file.
 
-    A first row without numbers is a header; empty rows and rows that start with # are skipped.
-    A header may name the unit, `x [mm], z [mm]`; without `unit` or that, metres are assumed.
-    Numbers may have decimal commas where something else parts them (`0,03; 0,02`).
+    A first row without numbers is a header; rows that start with # are skipped. A header may name
+    the unit, `x [mm], z [mm]`, in a row of its own too, and a comment, `# unit: mm`; without `unit`
+    or that, metres are assumed. Numbers may have decimal commas where something else parts them
+    (`0,03; 0,02`), and quotes.
 
     Raises:
         OutlineError: missing, a row that is not two numbers (with its line), or a
@@ -109,22 +116,27 @@ def load_polygon(path: str | Path, *, unit: str | None = None) -> Outline:
     except (OSError, ValueError) as error:
         raise OutlineError(path, f"not readable as text ({error})", "give x, z rows") from None
     points: list[list[float]] = []
-    header_seen, units = False, set[str]()
+    header_seen, units, gaps = False, set[str](), dict[int, int]()
     for number, line in enumerate(lines_of(text), start=1):
         fields = _fields(line)
-        if not fields or fields[0].startswith("#"):
+        if not fields:
+            gaps.setdefault(len(points), number)
+            continue
+        if fields[0].startswith("#"):
+            units |= _units(COMMENT_UNIT, line)
             continue
         try:
             row = [float(field) for field in fields]
         except ValueError:
+            named = _units(HEADER_UNIT, QUOTED.sub(r"\2", line))
             broken = any(field.lstrip("+-\u2212.")[:1].isdigit() for field in fields)
-            if points or header_seen or broken:
+            if points or header_seen and not named or broken:
                 raise OutlineError(
                     path, f"line {number} is '{line.strip()[:40]}'", "expected two numbers x, z"
                 ) from None
             header_seen = True
-            units |= set(HEADER_UNIT.findall(line))
-            if [field.strip('"').lower()[:1] for field in fields[:1]] in (["z"], ["y"]):
+            units |= named
+            if fields[0].lower()[:1] in ("z", "y"):
                 told = f"line {number} begins with {fields[0]}"
                 raise OutlineError(path, told, "expected x, z") from None
             continue
@@ -136,17 +148,32 @@ def load_polygon(path: str | Path, *, unit: str | None = None) -> Outline:
         points.append(row)
     if not points:
         raise OutlineError(path, "holds no vertices", "expected one x, z row for each")
-    if units and (len(units) > 1 or unit not in (None, *units)):
+    parting = [line for after, line in gaps.items() if 0 < after < len(points)]
+    if 0 < len(parting) < len(points) - 1:
+        told = f"line {parting[0]} is empty and parts the vertices"
+        raise OutlineError(path, told, "expected one outline without gaps")
+    if units - METRES_PER_UNIT.keys() or len(units) > 1 or units and unit not in (None, *units):
         told = f"its header is in {' and '.join(sorted(units))}"
-        raise OutlineError(path, told, f"expected one unit{f', {unit}' if unit else ''}")
+        raise OutlineError(path, told, f"expected one unit, {unit or ', '.join(METRES_PER_UNIT)}")
     unit = unit or (units.pop() if units else "m")
     scaled = np.array(points) * METRES_PER_UNIT[unit]
     return make_outline(path.stem, scaled, path=path, source=path.name)
 
 
 def _fields(line: str) -> list[str]:
-    """What stands between separators: semicolons, tabs or blanks, else commas."""
+    """What stands between separators: semicolons, tabs or blanks, else commas; without quotes."""
+    line = QUOTED.sub(lambda cell: _with_point(cell[2]), line)
     parts = [part.strip().rstrip(",") for part in WIDE_SEPARATOR.split(line.strip()) if part]
     if len(parts) == 2 and all(DECIMAL_COMMA.fullmatch(part) for part in parts):
-        return [part.replace(",", ".") for part in parts]
+        return [_with_point(part) for part in parts]
     return [field for field in SEPARATOR.split(line.strip()) if field]
+
+
+def _with_point(cell: str) -> str:
+    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell
+
+
+def _units(pattern: re.Pattern[str], text: str) -> set[str]:
+    """The units that a text names."""
+    names = {name for found in pattern.finditer(text.lower()) for name in found.groups() if name}
+    return {"in" if name.startswith("in") else name for name in names}

@@ -226,3 +226,23 @@ def test_intervals_are_numbers(learnt) -> None:
     low, high = prediction.quantile(0.05).numpy(), prediction.quantile(0.95).numpy()
     assert np.isfinite(low).all() and np.isfinite(high).all()
     assert (low <= high).all()
+
+
+def test_particles_and_card_of_two_beliefs_are_not_taken_for_one(learnt, tmp_path) -> None:
+    """Files of two runs, or of a run stopped in between, read as one belief without a word."""
+    belief = learnt[0]
+    for name, weights in (("a", belief.weights), ("b", belief.weights.flip(0))):
+        save_belief(replace(belief, weights=weights), tmp_path / name, "ycb21-z2")
+    data = (tmp_path / "b" / "belief.safetensors").read_bytes()
+    (tmp_path / "a" / "belief.safetensors").write_bytes(data)
+    with pytest.raises(RunError, match="does not belong to its belief.json .hash differs"):
+        load_belief(tmp_path / "a", belief.prior.shape)
+
+
+def test_a_card_whose_entries_are_not_those_of_the_particles_is_refused(learnt, tmp_path) -> None:
+    belief = learnt[0]
+    path = save_belief(belief, tmp_path, "ycb21-z2")
+    card = json.loads(path.read_text())
+    path.write_text(json.dumps(card | {"names": card["names"][:-1]}))
+    with pytest.raises(RunError, match="names and effects are not those of the"):
+        load_belief(tmp_path, belief.prior.shape)

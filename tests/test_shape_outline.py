@@ -197,6 +197,7 @@ def test_a_curve_that_touches_itself_is_refused():
         (SQUARE[[0, 1, 0, 1]], "no area"),
         ([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0]], "encloses no area"),
         (SQUARE * 1000, "looks like millimetres"),
+        (SQUARE / 0.0254, "it would be 0.039 m in cm, 0.1 m in in: give metres, or the unit"),
         (SQUARE / 1000, "expected 0.005 to 1 m"),
         (SQUARE * 1e6, "expected 0.005 to 1 m"),
         ([[0.0, 0.0], [0.1, np.nan], [0.1, 0.1]], "vertex 1 is (0.1, nan)"),

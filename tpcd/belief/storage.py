@@ -1,13 +1,14 @@
 """A belief on disk: `belief.safetensors` beside `belief.json`, nothing unpickled.
 
-The JSON says which shape prior it is, by its place and by the hash of its weights, since particles
-mean nothing under another prior.
+The JSON says which tensors it belongs to, by their hash, and which shape prior it is, by its place
+and by the hash of its weights, since particles mean nothing under another prior.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 
 import torch
@@ -35,12 +36,14 @@ def save_belief(belief: Belief, folder: str | Path, prior: str | Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {name: getattr(belief, name).contiguous() for name in _TENSORS}
     tensors |= {"low": belief.prior.low, "high": belief.prior.high}
-    write_bytes(folder / "belief.safetensors", save_tensors(tensors))
+    data = save_tensors(tensors)
+    write_bytes(folder / "belief.safetensors", data)
     return write_json(
         folder / "belief.json",
         {
             "format": "tpcd-belief",
             "format_version": FORMAT_VERSION,
+            "tensors_sha256": sha256(data).hexdigest(),
             "names": list(belief.prior.names),
             "units": list(belief.prior.units),
             "effects": effects_to_plain(belief.prior.effects, fingerprints=True),
@@ -87,14 +90,23 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
         shape = load_prior(place)
     data = Path(folder) / "belief.safetensors"
     try:
-        tensors = load_tensors(data.read_bytes())
+        content = data.read_bytes()
+        tensors = load_tensors(content)
         values = {name: tensors[name].to(torch.float64) for name in (*_TENSORS, "low", "high")}
     except FileNotFoundError as error:
         raise RunError(data, "no such file", "estimate again") from error
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise RunError(data, f"cannot be read ({error})", "estimate again") from error
+    prior = ParameterPrior(shape, values.pop("low"), values.pop("high"), effects)
+    found = sha256(content).hexdigest()
+    if card.get("tensors_sha256", found) != found:
+        fault = f"does not belong to its {path.name} (hash differs)"
+        raise RunError(data, fault, "estimate again, with --resume if the run was stopped")
+    if card.get("names") != list(prior.names) or values["vectors"].shape[-1] != prior.dimension:
+        told = f"its names and effects are not those of the {prior.dimension} entries of theta"
+        raise RunError(path, told, "estimate again")
     return Belief(
-        prior=ParameterPrior(shape, values.pop("low"), values.pop("high"), effects),
+        prior=prior,
         misfit=misfit,
         step=step,
         log_evidence=evidence["log_evidence"],

@@ -26,6 +26,8 @@ LARGEST_SIZE = 1.0
 """Largest plausible longer side of the bounding box [m]."""
 SMALLEST_EDGE = 1e-8
 """Vertices nearer than this to their predecessor count as the same vertex [m]."""
+LIKELY_MILLIMETRES = 30.0
+"""A size from which numbers that are no metres are likely millimetres."""
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Units of length a file with outlines can be in."""
 LARGEST_CORNER_REACH = 0.01
@@ -242,8 +244,15 @@ def _check_size(points: np.ndarray, blame: str | Path, where: str) -> None:
     if SMALLEST_SIZE <= size <= LARGEST_SIZE:
         return
     limits = f"expected {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} m"
-    if size > LARGEST_SIZE and SMALLEST_SIZE <= size / 1000 <= LARGEST_SIZE:
+    fitting = [
+        f"{size * factor:.2g} m in {unit}"
+        for unit, factor in METRES_PER_UNIT.items()
+        if SMALLEST_SIZE <= size * factor <= LARGEST_SIZE
+    ]
+    if size > LIKELY_MILLIMETRES and fitting:
         limits += ", this looks like millimetres: give metres, or the unit mm"
+    elif size > LARGEST_SIZE and fitting:
+        limits += f", it would be {', '.join(fitting)}: give metres, or the unit"
     raise OutlineError(blame, f"{where}is {size:.4g} m long", limits)
 
 

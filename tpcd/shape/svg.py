@@ -295,7 +295,8 @@ def _subpaths(
         y1, y2 = (length_of(element, key, height) for key in ("y1", "y2"))
         return [[np.array([[x1, y1], [x2, y2]])]]
     if tag == "circle":
-        radii = (length_of(element, "r", diagonal),) * 2
+        radius = length_of(element, "r", diagonal)
+        radii = (radius, radius)
     else:
         alone = {"rx": said(element, "ry", "0"), "ry": said(element, "rx", "0")}
         alone = {key: "0" if value == "auto" else value for key, value in alone.items()}
@@ -304,18 +305,18 @@ def _subpaths(
             length_of(element, "ry", height, alone["ry"]),
         )
     if tag == "rect":
-        corner = (length_of(element, "x", width), length_of(element, "y", height))
+        place = (length_of(element, "x", width), length_of(element, "y", height))
         size = (length_of(element, "width", width), length_of(element, "height", height))
-        return [_rectangle(corner, size, radii)]
+        return [_rectangle(place, size, radii)]
     centre = (length_of(element, "cx", width), length_of(element, "cy", height))
     return [ellipse_segments(centre, radii)]
 
 
 def _rectangle(
-    corner: tuple[float, float], size: tuple[float, float], radii: tuple[float, float]
+    place: tuple[float, float], size: tuple[float, float], radii: tuple[float, float]
 ) -> Segments:
     """A rectangle from its upper left corner on, with rounded corners."""
-    (x, y), (width, height) = corner, size
+    (x, y), (width, height) = place, size
     rx, ry = min(radii[0], width / 2), min(radii[1], height / 2)
     right, bottom = x + width, y + height
     stops = np.array(

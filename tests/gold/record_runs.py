@@ -32,7 +32,7 @@ SIMULATED = {
     "banana": (*BANANA, "--policy", "rich", "--steps", "6"),
     "banana_test": (*BANANA, "--policy", "test", "--steps", "20"),
     "can": (*CAN, "--steps", "40"),
-    "can_tilted": (*CAN, "--steps", "40", "--effects", "floor_tilt:tilt=0.03"),
+    "can_tilted": (*CAN, "--steps", "40", "--effects", "floor_tilt.angle=0.03"),
 }
 SMALL, RICH = ("--prior", "ycb21-z2"), ("--prior", "ycb-rich")
 RUNS: dict[str, tuple[str, ...]] = {
@@ -54,11 +54,11 @@ def main(checkout: Path, names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, options in SIMULATED.items():
             if not (EPISODES / f"{name}.csv").is_file():
-                command(checkout, "simulate", *options, "--name", name, "--out", str(EPISODES))
+                command(checkout, "simulate", *options, "--name", name, "--out", EPISODES.name)
         for name in names or RUNS:
             figures = figures_of(checkout, name, Path(folder))
             (HERE / "runs").mkdir(exist_ok=True)
-            text = json.dumps(figures, indent=0, sort_keys=True)
+            text = json.dumps(figures, separators=(",", ":"), sort_keys=True)
             (HERE / "runs" / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
@@ -82,7 +82,7 @@ def command(checkout: Path, script: str, *options: str) -> int:
     """Run a script of the checkout on one thread; verdicts have codes from 10 on."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
     line = [sys.executable, str(checkout / "scripts" / f"{script}.py"), *options]
-    code = subprocess.run(line, env=environment, cwd=checkout, check=False).returncode
+    code = subprocess.run(line, env=environment, cwd=HERE, check=False).returncode
     if code not in (0, *range(10, 15)):
         raise SystemExit(f"{script} ended with {code}: {' '.join(line)}")
     return code

@@ -37,9 +37,9 @@ def emulate(config: Emulation) -> None:
     import sys
 
     import torch
-    import yaml
 
     from tpcd.files import write_text
+    from tpcd.plain_yaml import to_yaml
     from tpcd.robot.emulator import emulated_scene
     from tpcd.robot.emulator.server import Server
     from tpcd.targets import check_target
@@ -55,7 +55,7 @@ def emulate(config: Emulation) -> None:
             "start_pose": scene.start_pose.tolist(),
             "compliance": config.compliance,
         }
-        write_text(config.truth, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        write_text(config.truth, to_yaml(content, flow=True))
     print(
         f"{scene.outline_name} over a floor that yields {config.surface_mm_per_10n:g} mm at"
         f" 10 N, on {config.address}, fault {config.fault}; Ctrl-C ends it",

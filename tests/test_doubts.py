@@ -16,9 +16,10 @@ from test_import_command import importing
 
 from tpcd.commands.plausibility import run_warnings
 from tpcd.data import Episode, check_episode, read_episode, write_episode
-from tpcd.data.doubts import doubts_told
+from tpcd.data.doubts import doubts_told, parse_doubts
 from tpcd.discrepancy.checks import read_data
 from tpcd.errors import EpisodeError
+from tpcd.plain_yaml import parse_yaml
 from tpcd.quality.finding import Finding, Weight
 
 DOUBTS = (
@@ -59,7 +60,9 @@ def test_doubts_of_every_weight_stand_in_the_yaml_and_come_back(world: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "doubts", ["[1]", "[{certain: it is so}]", "[{doubt: a, serious doubt: b}]", "[{doubt: 3}]"]
+    "doubts",
+    ["[1]", "[{certain: it is so}]", "[{doubt: a, serious doubt: b}]", "[{doubt: 3}]"]
+    + ["['serios doubt: a']", "['serious doubt: ']"],
 )
 def test_doubts_that_are_no_sentences_are_refused(doubts: str, world: Path, tmp_path: Path) -> None:
     text = (world / "explore.yaml").read_text() + f"doubts: {doubts}\n"
@@ -67,6 +70,23 @@ def test_doubts_that_are_no_sentences_are_refused(doubts: str, world: Path, tmp_
     (tmp_path / "a.csv").write_bytes((world / "explore.csv").read_bytes())
     with pytest.raises(EpisodeError, match="doubts: found .*expected WEIGHT: SENTENCE; weights"):
         read_episode(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "- serious doubt: the cable was loose",
+        "- 'serious doubt: the cable was loose'",
+        '- "serious doubt": "the cable was loose"',
+        "- serious doubt:the cable was loose",
+        "'Serious doubt: the cable was loose'",
+        "- |\n  serious doubt: the cable\n  was loose",
+        "- >-\n  serious\n  doubt: the cable was loose",
+    ],
+)
+def test_a_doubt_weighs_the_same_however_it_is_quoted(text: str) -> None:
+    (doubt,) = parse_doubts(Path("a.yaml"), parse_yaml(text))
+    assert doubt.weight is Weight.SERIOUS and str(doubt) == "the cable was loose"
 
 
 def test_a_plain_sentence_is_a_doubt(world: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def test_models_come_back_as_they_were_written(tmp_path: Path) -> None:
 FAULTS = {
     "no file": (None, "no such file"),
     "a folder": ("", "cannot be read"),
-    "no YAML": ("effects: [", "cannot be read"),
+    "no YAML": ("effects: [", "not valid YAML"),
     "a list": ("- floor_tilt", "is not a mapping"),
     "another key": ("effect: []", "has 'effect'"),
     "no list": ("effects: floor_tilt", "expected a list"),

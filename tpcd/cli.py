@@ -39,6 +39,7 @@ from tpcd import __version__
 from tpcd.cli_messages import check_config_files, parsing_problem, system_problem
 from tpcd.console import forgiving_console
 from tpcd.errors import TpcdError
+from tpcd.plain_yaml import PlainLoader
 
 if typing.TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -186,9 +187,11 @@ def check_numbers(
 def _parser(
     config: type, positional: Sequence[str], prog: str, description: str | None
 ) -> ArgumentParser:
-    from jsonargparse import ActionYesNo, ArgumentParser, set_parsing_settings
+    from jsonargparse import ActionYesNo, ArgumentParser, _loaders_dumpers, set_parsing_settings
 
     set_parsing_settings(docstring_parse_attribute_docstrings=True)
+    # Files and single values are read by one loader, for which there is no public door.
+    _loaders_dumpers.yaml_default_loader = PlainLoader
     parser = ArgumentParser(
         prog=prog,
         description=description,

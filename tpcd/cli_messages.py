@@ -14,8 +14,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from tpcd.errors import FileError
+from tpcd.plain_yaml import read_yaml
 
-KINDS = {"int": "a whole number", "float": "a finite number", "bool": "true or false"}
+KINDS = {"int": "a whole number", "float": "a finite number", "bool": "true or false",
+         "str": "text, in quotes where it looks like a number"}  # fmt: skip
 REMEDIES = {
     errno.EACCES: "choose a place where you may read and write",
     errno.EPERM: "choose a place where you may read and write",
@@ -36,6 +38,8 @@ def parsing_problem(message: str, names: Iterable[str]) -> str:
     names = list(names)
     if found := re.match(r'Parser key "([\w.]+)"( element \d+)?: (.*)', message):
         return f"{found[1]}: {_wrong_value(found[3])}"
+    if found := re.match(r"Value not boolean: (.*)\.$", message):
+        return f"found {found[1]!r}, expected true or false"
     if found := re.match(r"the following arguments are required: (.*)", message):
         missing = [name if name.startswith("-") else f"--{name}" for name in found[1].split(", ")]
         return f"{' and '.join(missing)} missing"
@@ -71,20 +75,9 @@ def file_of(error: OSError) -> str | None:
 
 def check_config_files(paths: Sequence[str]) -> None:
     """Refuse a configuration that is missing or no mapping of settings, by `FileError`."""
-    import yaml
-
     for name in paths:
         path, remedy = Path(name), "give a YAML file of settings such as config.yaml of a run"
-        if not path.is_file():
-            raise FileError(path, "no such file", remedy)
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-        except UnicodeDecodeError as error:
-            raise FileError(path, "not a UTF-8 text file", remedy) from error
-        except yaml.YAMLError as error:
-            mark = getattr(error, "problem_mark", None)
-            where = f" at line {mark.line + 1}" if mark else ""
-            raise FileError(path, f"not valid YAML{where}", "correct it by hand") from error
+        content = read_yaml(path, FileError, remedy)
         if not isinstance(content, dict):
             found = "nothing" if content is None else f"a {type(content).__name__}"
             raise FileError(path, f"holds {found}, expected settings by name", remedy)

@@ -21,6 +21,7 @@ from tpcd.cli_messages import REMEDIES, file_of
 from tpcd.errors import RunError
 from tpcd.files import read_json, to_plain, write_json, write_text
 from tpcd.ownership import check_none_within, is_lock, owned
+from tpcd.plain_yaml import read_yaml, to_yaml
 from tpcd.targets import ELSEWHERE, check_place
 from tpcd.versions import versions
 
@@ -196,22 +197,18 @@ def _episode_there(place: Path) -> bool:
 
 def _start(folder: Path, command: str, config: Mapping[str, Any] | Any) -> None:
     """Make the folder and write what is about to run."""
-    import yaml
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(folder, f"cannot be made ({error.strerror})", ELSEWHERE) from error
-    body = yaml.safe_dump(_kept(config), sort_keys=False, allow_unicode=True)
+    body = to_yaml(_kept(config))
     write_text(folder / CONFIG_FILE, f"# {command}\n{body}")
     write_json(folder / VERSIONS_FILE, {"command": command, **versions()})
 
 
 def _continue(folder: Path, config: Mapping[str, Any] | Any, free: Sequence[str]) -> None:
     """Refuse to go on with another configuration, and keep the new values."""
-    import yaml
-
-    before = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    before = read_yaml(folder / CONFIG_FILE, RunError)
     before, now = _kept(before), _kept(config)
     recorded = read_json(folder / VERSIONS_FILE) if (folder / VERSIONS_FILE).is_file() else {}
     began_in = Path(recorded.get("folder", ""))
@@ -223,7 +220,7 @@ def _continue(folder: Path, config: Mapping[str, Any] | Any, free: Sequence[str]
             folder, f"holds a run whose {_listed(differing)} not the same", "name a new folder"
         )
     if changed:
-        write_text(folder / CONFIG_FILE, yaml.safe_dump(now, sort_keys=False))
+        write_text(folder / CONFIG_FILE, to_yaml(now))
         write_json(folder / VERSIONS_FILE, recorded | {"folder": os.getcwd()})
 
 
@@ -267,8 +264,6 @@ def write_results(
     `table` is what was printed, or the numbers behind it, one mapping for each row; `extra` adds
     further entries beside it. Raises `RunError` when the folder was not made by `run_folder`.
     """
-    import yaml
-
     folder = Path(folder)
     if not (folder / CONFIG_FILE).is_file() or not (folder / VERSIONS_FILE).is_file():
         raise RunError(folder, "is not an opened run", "make it with run_folder first")
@@ -278,7 +273,7 @@ def write_results(
         "table": list(table),
         **extra,
         "seeds": list(seeds),
-        "config": yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8")),
+        "config": read_yaml(folder / CONFIG_FILE, RunError),
         "versions": recorded,
     }
     return write_json(folder / RESULTS_FILE, content)

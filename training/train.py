@@ -14,6 +14,7 @@ from tpcd.cli import run
 from tpcd.errors import RunError
 from tpcd.files import read_json
 from tpcd.ownership import owned
+from tpcd.plain_yaml import read_yaml
 from tpcd.results import CONFIG_FILE, resumed_run, run_folder, write_results
 from tpcd.targets import check_folder
 from training.config import TrainingConfig
@@ -72,10 +73,8 @@ def train_prior(config: Training) -> None:
 def _check_same_optimiser(out: Path, config: Training) -> None:
     """Refuse to resume with settings by which the steps ahead would be other ones: only how many
     there are, and on how many threads, may change."""
-    import yaml
-
     path = out / CONFIG_FILE
-    saved = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    saved = read_yaml(path, RunError) if path.is_file() else None
     before = saved.get("optim") if isinstance(saved, dict) else None
     if not isinstance(before, dict):
         raise RunError(out, f"holds no {CONFIG_FILE} of a training", "leave out --resume")

@@ -58,17 +58,16 @@ def combine(config: Combine) -> None:
 def _finished_run(folder: Path) -> tuple[Blind, dict[str, Any]]:
     """What a run was asked, and by which revision; raises `RunError` where it is none or not done,
     since keys are not opened before."""
-    import yaml
-
     from eval.blind.trial import read_verdicts
     from tpcd.errors import RunError
     from tpcd.files import read_json
+    from tpcd.plain_yaml import read_yaml
     from tpcd.results import CONFIG_FILE, VERSIONS_FILE
 
     versions = read_json(folder / VERSIONS_FILE) if (folder / VERSIONS_FILE).is_file() else {}
     if versions.pop("command", None) != COMMAND:
         raise RunError(folder, f"is no run of {COMMAND}", "name folders that it wrote")
-    kept = yaml.safe_load((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    kept = read_yaml(folder / CONFIG_FILE, RunError)
     asked = Blind(
         suites=tuple(kept["suites"]),
         **{name: kept[name] for name in ("runs", "seed", "prior", "quick")},

@@ -6,11 +6,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from tpcd.effects.model import Model, effects_to_plain, load_model
 from tpcd.errors import RunError
 from tpcd.files import write_text
+from tpcd.plain_yaml import read_yaml, to_yaml
 
 MODEL_FILE = "model.yaml"
 
@@ -28,7 +27,7 @@ def check_kept_model(model: Model, folder: Path) -> None:
     if not (folder / "belief.json").is_file():
         return
     path = folder / MODEL_FILE
-    before = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else _plain(Model())
+    before = read_yaml(path, RunError) if path.is_file() else _plain(Model())
     if before != _plain(model):
         raise RunError(folder, "holds a run whose model is not the same", "name a new folder")
 
@@ -36,7 +35,7 @@ def check_kept_model(model: Model, folder: Path) -> None:
 def keep_model(model: Model, folder: Path, given: Path | None) -> None:
     """Write the model, as read from the file `given`, into a run's folder."""
     if given is not None:
-        text = yaml.safe_dump(_plain(model), sort_keys=False, allow_unicode=True)
+        text = to_yaml(_plain(model))
         write_text(folder / MODEL_FILE, f"# as read from {given}\n{text}")
 
 

@@ -7,6 +7,7 @@ doubts:
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from tpcd.quality.finding import Finding, Weight
 
 WEIGHTS = {weight.value: weight for weight in (Weight.DOUBT, Weight.SERIOUS)}
 
+WEIGHED = re.compile(r"([\w\s]*doubt)\s*:(.*)", re.IGNORECASE | re.DOTALL)
+"""A doubt as one text: what YAML makes of it in quotes."""
+
 
 def encode_doubts(doubts: Iterable[Finding]) -> list[dict[str, str]]:
     """The doubts as the YAML has them: weight to sentence."""
@@ -23,21 +27,25 @@ def encode_doubts(doubts: Iterable[Finding]) -> list[dict[str, str]]:
 
 
 def parse_doubts(path: Path, content: Any) -> tuple[Finding, ...]:
-    """The doubts of a YAML; plain sentences count as well. Raises `EpisodeError`."""
+    """The doubts of a YAML, in quotes or not; plain sentences count as well. Raises
+    `EpisodeError`."""
     if content is None:
         return ()
-    entries = content if isinstance(content, list) else [content]
     found = []
-    for entry in entries:
-        pairs = list(entry.items()) if isinstance(entry, dict) else [(Weight.DOUBT.value, entry)]
-        weight, sentence = pairs[0] if len(pairs) == 1 else (None, None)
-        if weight not in WEIGHTS or not isinstance(sentence, str):
+    for entry in content if isinstance(content, list) else [content]:
+        weight, sentence = Weight.DOUBT.value, entry
+        if isinstance(entry, dict) and len(entry) == 1:
+            ((weight, sentence),) = entry.items()
+        elif isinstance(entry, str) and (quoted := WEIGHED.match(entry)):
+            weight, sentence = quoted.groups()
+        weight = " ".join(str(weight).lower().split())
+        if weight not in WEIGHTS or not isinstance(sentence, str) or not sentence.strip():
             raise EpisodeError(
                 path,
                 f"doubts: found {entry!r}, expected WEIGHT: SENTENCE",
                 f"weights are {', '.join(WEIGHTS)}",
             )
-        found.append(Finding("accepted", WEIGHTS[weight], sentence))
+        found.append(Finding("accepted", WEIGHTS[weight], " ".join(sentence.split())))
     return tuple(found)
 
 

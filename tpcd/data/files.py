@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-import yaml
 
 from tpcd.data.checks import check_rows, check_steps
 from tpcd.data.episode import COLUMNS, Episode
@@ -24,6 +23,7 @@ from tpcd.data.measured import NoCommandsError
 from tpcd.data.table import Table, encode_table, read_table
 from tpcd.errors import EpisodeError
 from tpcd.files import named
+from tpcd.plain_yaml import parse_yaml
 
 TABLE_SUFFIXES = (".csv", ".parquet")
 
@@ -114,7 +114,7 @@ def episode_contents(
         doubts=episode.doubts,
     )
     header_bytes = encode_header(header)
-    parse_header(yaml.safe_load(header_bytes), header_path)
+    parse_header(parse_yaml(header_bytes), header_path)
     commands, poses, wrenches = (
         value.numpy() for value in (episode.commands, episode.poses, episode.wrenches)
     )

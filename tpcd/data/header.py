@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from tpcd.contract import LARGEST_LENGTH, check_stiffness
 from tpcd.data.doubts import encode_doubts, parse_doubts
+from tpcd.data.table import NUMBER
 from tpcd.errors import EpisodeError
 from tpcd.parameters import LARGEST_FRICTION, SCENE_NAMES, SCENE_UNITS
+from tpcd.plain_yaml import read_yaml, to_yaml
 from tpcd.quality.finding import Finding
 
 KEYS = (
@@ -65,32 +66,7 @@ def read_header(path: Path) -> Header:
             "no such file: every episode has a YAML beside its table",
             "write one with the keys stiffness and sensor_std",
         )
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8-sig"), _UniqueKeys)
-    except UnicodeDecodeError as error:
-        raise EpisodeError(path, "not a UTF-8 text file", "save it in UTF-8") from error
-    except _RepeatedKey as error:
-        raise EpisodeError(path, f"key {error} appears twice", "remove one of them") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
-        raise EpisodeError(path, f"not valid YAML{where}", "correct it by hand") from error
-    return parse_header(content, path)
-
-
-class _RepeatedKey(yaml.YAMLError):
-    """A key that a mapping holds twice."""
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """Plain YAML, in which the second of two equal keys does not silently win."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        repeated = [key for key in keys if keys.count(key) > 1]
-        if repeated:
-            raise _RepeatedKey(repeated[0])
-        return super().construct_mapping(node, deep)
+    return parse_header(read_yaml(path, EpisodeError), path)
 
 
 def parse_header(content: Any, path: Path) -> Header:
@@ -159,8 +135,7 @@ def encode_header(header: Header) -> bytes:
         }
     if header.doubts:
         content["doubts"] = encode_doubts(header.doubts)
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    return text.encode("utf-8")
+    return to_yaml(content, flow=True).encode("utf-8")
 
 
 def _sensor_std(path: Path, value: Any) -> tuple[float, ...]:
@@ -245,11 +220,9 @@ def _numbers(
 
 
 def _number(path: Path, key: str, value: Any) -> float:
-    """A finite number; text such as '2e-4', which YAML 1.1 does not read as a number, counts."""
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
+    """A finite number, in quotes or not."""
+    text = value if isinstance(value, str) and NUMBER.fullmatch(value) else "nan"
+    number = float(value if type(value) in (int, float) else text)
     if not math.isfinite(number):
         raise EpisodeError(
             path, f"{key}: found {value!r}, expected a finite number", "write a plain number"
@@ -260,6 +233,6 @@ def _number(path: Path, key: str, value: Any) -> float:
 def _text(path: Path, key: str, value: Any) -> str | None:
     if value is None or isinstance(value, str):
         return value
-    if isinstance(value, int | float):
+    if type(value) is int:
         return str(value)
     raise EpisodeError(path, f"{key}: found {value!r}, expected text", "put it in quotes")

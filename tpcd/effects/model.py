@@ -31,8 +31,6 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from tpcd.effects.catalogue import KNOWN, find_effect
 from tpcd.effects.declare import DeclaredEffect
 from tpcd.effects.own import file_sha256, load_effects
@@ -40,6 +38,7 @@ from tpcd.effects.protocol import Effect, EffectParameter, effect_to_plain
 from tpcd.effects.shape_change import UNCHANGED, ShapeChange, shape_from_plain
 from tpcd.errors import ModelError
 from tpcd.files import write_text
+from tpcd.plain_yaml import read_yaml, to_yaml
 from tpcd.simulator.record import StepSettings
 
 Found = Mapping[str, Mapping[str, tuple[float, float]]]
@@ -72,12 +71,7 @@ class Model:
 def load_model(path: str | Path) -> Model:
     """Read a model file; raises `ModelError` with what is wrong in one line."""
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ModelError(path, "no such file", "give the model.yaml that diagnose wrote") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ModelError(path, f"cannot be read ({' '.join(str(error).split())})") from error
+    content = read_yaml(path, ModelError, "give the model.yaml that diagnose wrote")
     if not isinstance(content, Mapping):
         raise ModelError(path, "is not a mapping", "expected 'effects' and optionally 'step'")
     unknown = sorted(set(content) - {"effects", "step", "shape", "notes"})
@@ -116,7 +110,7 @@ def write_model(model: Model, path: str | Path, notes: str | None = None) -> Pat
         content["shape"] = model.shape.to_plain()
     if notes:
         content["notes"] = notes
-    return write_text(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    return write_text(path, to_yaml(content))
 
 
 def effects_to_plain(effects: Sequence[Effect], fingerprints: bool = False) -> list[dict[str, Any]]:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import yaml
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from tpcd.data.episode import Episode
 from tpcd.data.files import episode_contents, read_rows, write_together
 from tpcd.data.header import Header
 from tpcd.errors import EpisodeError
+from tpcd.plain_yaml import read_yaml, to_yaml
 from tpcd.truth.diagnosis_motion import diagnosis_motion
 from tpcd.truth.motions import (
     History,
@@ -171,7 +171,7 @@ def recording_contents(
     }
     if made_by:
         content["made_by"] = dict(made_by)
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
+    text = to_yaml(content, flow=True)
     contents[Path(f"{stem}.truth.yaml")] = text.encode("utf-8")
     return contents
 
@@ -194,10 +194,8 @@ def read_truth(path: str | Path) -> tuple[Episode, Scene]:
     """
     path = Path(path)
     scene_path = _truth_path(path, "yaml")
-    if not scene_path.is_file():
-        raise EpisodeError(scene_path, "no such file", "only simulated episodes have a truth")
+    content = read_yaml(scene_path, EpisodeError, "only simulated episodes have a truth")
     try:
-        content = yaml.safe_load(scene_path.read_text(encoding="utf-8"))
         theta = content["theta"]
         scene = Scene(
             outline_name=content["outline"]["name"],
@@ -210,7 +208,7 @@ def read_truth(path: str | Path) -> tuple[Episode, Scene]:
             start_pose=_tensor(content["start_pose"]),
             stiffness=_tensor(content["stiffness"]),
         )
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise EpisodeError(scene_path, f"not a truth file ({reason})", "simulate again") from error
     header = Header(

@@ -69,6 +69,10 @@ def test_units_are_turned_into_metres(tmp_path, unit, factor, ending):
         '"x","z"\n"0","0"\n"0.06","0"\n"0.06","0.09"\n"0","0.09"\n',
         '"0,0","0,0"\n"0,06","0,0"\n"0,06","0,09"\n"0,0","0,09"\n',
         "'0';'0'\n'0,06';'0'\n'0,06';'0,09'\n'0';'0,09'\n",
+        '"0,0";"0,0"\n"0,06";"0"\n"0,06";"0,09"\n"0";"0,09"\n',
+        '"x","z"\n"0.0","0.0"\n"0.06","0"\n"0.06","0.09"\n"0","0.09"\n',
+        '"x [m]","z [m]"\n"0,0","0,0"\n"0,06","0"\n"0,06","0,09"\n"0","0,09"\n',
+        '"x [mm]"; "z [mm]"\n"0,0"; "0,0"\n"60"; "0"\n"60"; "90"\n"0"; "90"\n',
     ],
 )
 def test_decimal_commas_are_read_where_something_else_parts_the_numbers(tmp_path, rows):
@@ -139,7 +143,9 @@ def test_a_csv_in_millimetres_without_saying_so_gets_the_hint(tmp_path):
         ("x [ft],z [ft]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in ft"),
         ("0,0\n0.1,0\n0.1,0.1\n\n0.2,0\n0.3,0\n0.3,0.1\n", "line 4 is empty and parts"),
         ("0,0\n0.1\n0.1,0.1\n", "line 2 has 1 numbers"),
-        ("0,0\n0.1,nan\n0.1,0.1\n", "vertex 1 is (0.1, nan)"),
+        ("0,0\n0.1,nan\n0.1,0.1\n", "line 2 is '0.1,nan'"),
+        ("0;0\n100,5;0\n100;1.234\n", "line 3: z is '1.234', which may be 1.234 or 1234"),
+        ("0,5;0\n100,5;0\n100.5;10\n", "line 3: x is '100.5'; expected numbers: elsewhere"),
         ("0,0\n0.1,0.1\n0.1,0\n0,0.1\n", "crosses or touches itself at (0.05, 0.05) m"),
     ],
 )

@@ -19,8 +19,8 @@ import torch
 
 from tpcd.contract import LARGEST_LENGTH, check_stiffness
 from tpcd.data.doubts import encode_doubts, parse_doubts
-from tpcd.data.table import NUMBER
 from tpcd.errors import EpisodeError
+from tpcd.numerals import NUMBER
 from tpcd.parameters import LARGEST_FRICTION, SCENE_NAMES, SCENE_UNITS
 from tpcd.plain_yaml import read_yaml, to_yaml
 from tpcd.quality.finding import Finding

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from tpcd.errors import EpisodeError
+from tpcd.numerals import NUMBER
 
-NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 WHOLE_NUMBER = re.compile(r"-?(0|[1-9]\d{0,18})")
 LARGEST = 2**63
 """Of int64, which holds nanoseconds since 1970."""

@@ -14,13 +14,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from tpcd.numerals import PARTED, decimal_mark, is_number, marks_shown
+
 SEPARATORS = (",", ";", "\t", "|", " ")
 NULLS = ("", "-", "--", "?", "na", "n/a", "#n/a", "nan", "-nan", "null", "none", "nil", "1.#ind",
          "-1.#ind", "1.#qnan")  # fmt: skip
 """Cells, in small letters, that say that there is no number."""
-NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.IGNORECASE)
-COMMA_NUMBER = re.compile(r"[+-]?(\d+(,\d+)?|,\d+)([eE][+-]?\d+)?")
-THOUSANDS = re.compile(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?")
 REMARK = re.compile(r"^\s*(#|%|//|\*)+\s*")
 SAMPLE = 400
 """So many lines from the beginning show the layout."""
@@ -57,10 +56,8 @@ class Layout:
     names: tuple[str, ...]
     first: int
     """Index of the first line of numbers, from 0."""
-    comma: bool = False
-    """Whether the decimal mark is a comma."""
-    whole: bool = False
-    """Whether no number shown had a decimal mark, so that it may be either."""
+    mark: str = "."
+    """The decimal mark of the numbers shown; "" where columns differ."""
     units: tuple[str, ...] = ()
     """Units by the line below the names, "" where they are not known."""
     notes: tuple[str, ...] = ()
@@ -136,19 +133,12 @@ def find_layout(lines: Sequence[str], more: Sequence[str] = ()) -> Layout:
         raise ValueError(
             f"line {first} has {count - 1} names, the rows below it have {count} cells"
         )
-    numbers = [cell for row in table for cell in row if cell]
-    commas = sum("," in cell and COMMA_NUMBER.fullmatch(cell) is not None for cell in numbers)
-    points = sum("." in cell and NUMBER.fullmatch(cell) is not None for cell in numbers)
-    return Layout(separator, names, first, commas > points, not commas + points, units, notes)
-
-
-def is_number(cell: str) -> bool:
-    """Whether a cell is a number, with a decimal point or comma."""
-    return bool(NUMBER.fullmatch(cell) or COMMA_NUMBER.fullmatch(cell))
+    mark = decimal_mark(*marks_shown(cell for row in table for cell in row))
+    return Layout(separator, names, first, mark, units, notes)
 
 
 def _looks_numeric(cell: str) -> bool:
-    return is_number(cell) or bool(THOUSANDS.fullmatch(cell))
+    return is_number(cell) or bool(PARTED.fullmatch(cell))
 
 
 def _separator(lines: Sequence[str]) -> tuple[str, int]:

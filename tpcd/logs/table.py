@@ -1,35 +1,29 @@
 """Tables of numbers from elsewhere: CSV with any separator, and Parquet.
 
-Unlike the table of an episode, nothing is expected of such a file but a line of names. A column
-of lists becomes one column for each entry, numbered like those of Universal Robots' recordings:
-`pose` of six becomes `pose_0` to `pose_5`. Whole numbers that a float cannot hold stay whole.
+Unlike the table of an episode, nothing is expected of such a file but a line of names.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tpcd.logs.kinds import Refused, columns_of
 from tpcd.logs.layout import (
     NULLS,
-    THOUSANDS,
     Layout,
     find_layout,
     is_null,
-    is_number,
     split,
     unit_of_name,
 )
 from tpcd.logs.log import LogError
+from tpcd.numerals import odd_cell
 from tpcd.text import encoding_of, lines_of, read_ends, read_text
-
-EXACT = 2**53
-"""Whole numbers up to this are exact as floats."""
-
 
 Columns = Mapping[str, np.ndarray]
 
@@ -46,12 +40,14 @@ class Table(dict[str, np.ndarray]):
     """By a line of units."""
     moments: dict[str, str]
     """Columns that are moments or durations by their kind, and in which unit."""
+    refused: dict[str, Refused]
+    """Columns that cannot be read, as lists of unequal length."""
     notes: tuple[str, ...] = ()
     """What was passed over."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self.path, self.units, self.moments = path, {}, {}
+        self.path, self.units, self.moments, self.refused = path, {}, {}, {}
 
 
 def read_columns(path: Path) -> Table:
@@ -73,12 +69,17 @@ def read_columns(path: Path) -> Table:
     for k, name in enumerate(names):
         # One column after another, so that no more than one is there twice.
         part, parts[k] = parts[k], None
-        for column, values, unit in _flat(name, part, columns.layout):
-            if column in columns:
-                raise LogError(path, f"column {column!r} appears twice", "rename one of them")
-            columns[column] = values
-            if unit:
-                columns.moments[column] = unit
+        for column in columns_of(name, part, _usual_mark(columns)):
+            if column.name in columns:
+                raise LogError(path, f"column {column.name!r} appears twice", "rename one of them")
+            if isinstance(column, Refused):
+                columns.refused[column.name] = column
+                continue
+            columns[column.name] = column.values
+            if column.unit:
+                columns.moments[column.name] = column.unit
+            if column.note:
+                columns.notes += (column.note,)
     _release()
     if not columns or not len(next(iter(columns.values()))):
         raise LogError(path, "no rows below the line of names", "export it again")
@@ -107,19 +108,10 @@ def place(columns: Columns, row: int) -> str:
 
 def text_among_numbers(columns: Columns, column: str) -> tuple[str, str]:
     """What stands in a column that should hold numbers, and where; and what to do."""
-    comma = isinstance(columns, Table) and columns.layout is not None and columns.layout.comma
-    cells = [str(cell) for cell in columns[column]]
-    wrong = [k for k, cell in enumerate(cells) if not (is_null(cell) or _plain(cell, comma))]
-    row = wrong[0] if wrong else 0
-    found = f"column {column!r} holds {cells[row]!r} in {place(columns, row)}"
-    if len(wrong) > 1:
-        found += f", and text in {len(wrong)} of {len(cells)} rows"
-    if is_number(cells[row]):
-        mark = "commas" if comma else "points"
-        return found, f"expected numbers: elsewhere in the file decimals have {mark}"
-    if THOUSANDS.fullmatch(cells[row]):
-        return found, "expected numbers without marks between the thousands"
-    return found, "expected numbers, or an empty cell where there is none"
+    cells = [str(cell).strip().replace("\N{MINUS SIGN}", "-") for cell in columns[column]]
+    numbers = ["0" if is_null(cell) else cell for cell in cells]
+    row, more, remedy = odd_cell(numbers, _usual_mark(columns)) or (0, "", "expected numbers")
+    return f"column {column!r} holds {cells[row]!r} in {place(columns, row)}{more}", remedy
 
 
 def _parquet(path: Path) -> Any:
@@ -163,14 +155,15 @@ def _csv(path: Path, columns: Table) -> Any:
             csv.ReadOptions(column_names=names, skip_rows=layout.first),
             csv.ParseOptions(delimiter=layout.separator, invalid_row_handler=ragged),
             csv.ConvertOptions(
-                decimal_point="," if layout.comma and layout.separator != "," else ".",
+                decimal_point=layout.mark or ".",
                 null_values=[*NULLS, *(n.upper() for n in NULLS), "NaN", "Nan", "None", "Null"],
                 column_types=kinds,
             ),
         )
 
     try:
-        table = read({})
+        # Where columns differ in their decimal mark, each is read for itself.
+        table = read({} if layout.mark else dict.fromkeys(names, string()))
     except ArrowInvalid:
         # The kind of a column is found on the first rows; text further down breaks it.
         table = read(dict.fromkeys(names, string()))
@@ -207,76 +200,6 @@ def _passed_over(odd: list[str], path: Path, encoding: str, layout: Layout) -> t
     return tuple(notes)
 
 
-def _flat(name: str, column: Any, layout: Layout | None) -> Iterator[tuple[str, np.ndarray, str]]:
-    """Name, values and unit (of times, by their kind) of the columns that one becomes."""
-    from pyarrow import types
-
-    kind = column.type
-    if types.is_dictionary(kind):
-        yield from _flat(name, column.cast(kind.value_type), layout)
-    elif types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):
-        inside, cells = kind.value_type, column.to_pylist()
-        lengths = {len(cell) for cell in cells if cell is not None}
-        if len(lengths) == 1 and (types.is_floating(inside) or types.is_integer(inside)):
-            gap = [None] * max(lengths)
-            vectors = np.array([gap if cell is None else cell for cell in cells], dtype=np.float64)
-            yield from ((f"{name}_{k}", values, "") for k, values in enumerate(vectors.T))
-    elif types.is_timestamp(kind) or types.is_duration(kind) or types.is_time(kind):
-        whole = column.cast("int32" if types.is_time32(kind) else "int64").cast("int64")
-        yield name, _whole(whole), kind.unit
-    elif types.is_date(kind):
-        yield name, 86400.0 * _whole(column.cast("date32").cast("int32").cast("int64")), "s"
-    elif types.is_integer(kind):
-        yield name, _whole(column), ""
-    elif types.is_floating(kind) or types.is_boolean(kind) or types.is_decimal(kind):
-        yield name, column.cast("float64").to_numpy(), ""
-    elif types.is_null(kind):
-        yield name, np.full(len(column), np.nan), ""
-    else:
-        yield _text(name, column, layout)
-
-
-def _whole(column: Any) -> np.ndarray:
-    """Whole numbers as float64, or as they are where a float cannot hold them and none lacks."""
-    compute = _compute()
-    if not column.null_count and len(column):
-        ends = compute.min_max(column).as_py()
-        if max(abs(ends["min"]), abs(ends["max"])) > EXACT:
-            return column.to_numpy()
-    return column.cast("float64", safe=False).to_numpy()
-
-
-def _text(name: str, column: Any, layout: Layout | None) -> tuple[str, np.ndarray, str]:
-    """Text as numbers or as moments, where all of it can be read so; else as it is."""
-    from pyarrow import ArrowInvalid, ArrowNotImplementedError, scalar, string, timestamp
-
-    compute = _compute()
-    try:
-        bare = compute.utf8_trim_whitespace(column.cast(string()))
-    except (ArrowInvalid, ArrowNotImplementedError):
-        return name, np.array([str(value) for value in column.to_pylist()], dtype=np.str_), ""
-    lowered = compute.utf8_lower(bare)
-    known = compute.is_in(lowered, value_set=_nulls())
-    bare = compute.if_else(known, scalar(None, string()), bare)
-    plain = compute.replace_substring(bare, "\N{MINUS SIGN}", "-")
-    if layout is not None and (layout.comma or layout.whole):
-        plain = compute.replace_substring(plain, ",", ".")
-        if compute.any(compute.match_substring(bare, ".")).as_py():
-            plain = bare
-    if bare.null_count < len(bare):
-        for kind, unit in (
-            ("float64", ""),
-            (timestamp("ns"), "ns"),
-            (timestamp("ns", "UTC"), "ns"),
-        ):
-            try:
-                found = plain.cast(kind)
-            except (ArrowInvalid, ArrowNotImplementedError):
-                continue
-            return name, _whole(found.cast("int64")) if unit else found.to_numpy(), unit
-    return name, np.array([str(value) for value in column.to_pylist()], dtype=np.str_), ""
-
-
 def _release() -> None:
     """Give back what pyarrow keeps for its next table, which may be as large as this one."""
     from pyarrow import default_memory_pool
@@ -284,19 +207,7 @@ def _release() -> None:
     default_memory_pool().release_unused()
 
 
-def _compute() -> Any:
-    import pyarrow.compute
-
-    return pyarrow.compute
-
-
-def _nulls() -> Any:
-    from pyarrow import array
-
-    return array(NULLS)
-
-
-def _plain(cell: str, comma: bool) -> bool:
-    """Whether a cell is a number with the decimal mark of the file."""
-    bare = cell.strip().replace("\N{MINUS SIGN}", "-")
-    return is_number(bare) and ("." if comma else ",") not in bare
+def _usual_mark(columns: Columns) -> str:
+    """The decimal mark of most numbers of a text table."""
+    layout = columns.layout if isinstance(columns, Table) else None
+    return "." if layout is None else layout.mark

@@ -6,6 +6,7 @@ checked by `make_outline`: simple, counter-clockwise, centred, in metres.
 
 from __future__ import annotations
 
+import csv
 import re
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tpcd.errors import OutlineError
+from tpcd.numerals import decimal_mark, is_number, marks_shown, odd_cell, read_number
 from tpcd.shape.mesh import MESH_ENDINGS, load_mesh
 from tpcd.shape.outline import METRES_PER_UNIT, Outline, make_outline
 from tpcd.shape.section import CuttingPlane, cut_mesh
@@ -21,7 +23,6 @@ from tpcd.text import encoding_of, lines_of, read_text
 
 SEPARATOR = re.compile(r"[,;\t ]+")
 WIDE_SEPARATOR = re.compile(r"[;\t ]+")
-DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 QUOTED = re.compile(r"""(["'])(.*?)\1""")
 UNITS = r"(m|cm|mm|in|inch|inches|dm|ft|um|\u00b5m|px|pt)"
 HEADER_UNIT = re.compile(
@@ -115,62 +116,74 @@ def load_polygon(path: str | Path, *, unit: str | None = None) -> Outline:
         raise OutlineError(path, "not found", "give a .csv file of x, z rows") from None
     except (OSError, ValueError) as error:
         raise OutlineError(path, f"not readable as text ({error})", "give x, z rows") from None
-    points: list[list[float]] = []
+    rows: list[list[str]] = []
+    places: list[int] = []
     header_seen, units, gaps = False, set[str](), dict[int, int]()
     for number, line in enumerate(lines_of(text), start=1):
         fields = _fields(line)
         if not fields:
-            gaps.setdefault(len(points), number)
+            gaps.setdefault(len(rows), number)
             continue
         if fields[0].startswith("#"):
             units |= _units(COMMENT_UNIT, line)
             continue
-        try:
-            row = [float(field) for field in fields]
-        except ValueError:
+        if not all(map(is_number, fields)):
             named = _units(HEADER_UNIT, QUOTED.sub(r"\2", line))
             broken = any(field.lstrip("+-\u2212.")[:1].isdigit() for field in fields)
-            if points or header_seen and not named or broken:
+            if rows or header_seen and not named or broken:
                 raise OutlineError(
                     path, f"line {number} is '{line.strip()[:40]}'", "expected two numbers x, z"
-                ) from None
+                )
             header_seen = True
             units |= named
             if fields[0].lower()[:1] in ("z", "y"):
                 told = f"line {number} begins with {fields[0]}"
-                raise OutlineError(path, told, "expected x, z") from None
+                raise OutlineError(path, told, "expected x, z")
             continue
-        if len(row) != 2:
+        if len(fields) != 2:
             expected = "expected x, z"
-            if len(row) == 4 and line.count(",") == 3:
+            if len(fields) == 4 and line.count(",") == 3:
                 expected += "; with decimal commas, part x and z by a semicolon"
-            raise OutlineError(path, f"line {number} has {len(row)} numbers", expected)
-        points.append(row)
-    if not points:
+            raise OutlineError(path, f"line {number} has {len(fields)} numbers", expected)
+        rows.append(fields)
+        places.append(number)
+    if not rows:
         raise OutlineError(path, "holds no vertices", "expected one x, z row for each")
-    parting = [line for after, line in gaps.items() if 0 < after < len(points)]
-    if 0 < len(parting) < len(points) - 1:
+    parting = [line for after, line in gaps.items() if 0 < after < len(rows)]
+    if 0 < len(parting) < len(rows) - 1:
         told = f"line {parting[0]} is empty and parts the vertices"
         raise OutlineError(path, told, "expected one outline without gaps")
     if units - METRES_PER_UNIT.keys() or len(units) > 1 or units and unit not in (None, *units):
         told = f"its header is in {' and '.join(sorted(units))}"
         raise OutlineError(path, told, f"expected one unit, {unit or ', '.join(METRES_PER_UNIT)}")
     unit = unit or (units.pop() if units else "m")
-    scaled = np.array(points) * METRES_PER_UNIT[unit]
+    scaled = _numbers(path, rows, places) * METRES_PER_UNIT[unit]
     return make_outline(path.stem, scaled, path=path, source=path.name)
 
 
+def _numbers(path: Path, rows: list[list[str]], places: list[int]) -> np.ndarray:
+    """Coordinates, in each column with the decimal mark that it shows, or else the whole file."""
+    usual = decimal_mark(*marks_shown(cell for row in rows for cell in row))
+    columns = []
+    for name, cells in zip("xz", zip(*rows, strict=True), strict=True):
+        if odd := odd_cell(cells, usual):
+            row, more, remedy = odd
+            raise OutlineError(path, f"line {places[row]}: {name} is {cells[row]!r}{more}", remedy)
+        mark = decimal_mark(*marks_shown(cells), usual)
+        columns.append([read_number(cell, mark) for cell in cells])
+    return np.array(columns).T
+
+
 def _fields(line: str) -> list[str]:
-    """What stands between separators: semicolons, tabs or blanks, else commas; without quotes."""
-    line = QUOTED.sub(lambda cell: _with_point(cell[2]), line)
-    parts = [part.strip().rstrip(",") for part in WIDE_SEPARATOR.split(line.strip()) if part]
-    if len(parts) == 2 and all(DECIMAL_COMMA.fullmatch(part) for part in parts):
-        return [_with_point(part) for part in parts]
-    return [field for field in SEPARATOR.split(line.strip()) if field]
-
-
-def _with_point(cell: str) -> str:
-    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell
+    """What stands between separators, out of its quotes: semicolons, tabs or blanks, else
+    commas."""
+    line = line.strip().replace("'", '"')
+    parts = [part.rstrip(",").strip('"') for part in WIDE_SEPARATOR.split(line) if part]
+    if len(parts) == 2 and all(is_number(part) and part[0] != "," for part in parts):
+        return parts
+    if '"' in line:
+        return [cell for cell in next(csv.reader([line], skipinitialspace=True)) if cell]
+    return [field for field in SEPARATOR.split(line) if field]
 
 
 def _units(pattern: re.Pattern[str], text: str) -> set[str]:

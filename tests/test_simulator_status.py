@@ -23,7 +23,7 @@ from tpcd.contact import ContactScene, terrain_gaps
 from tpcd.data.header import parse_header
 from tpcd.errors import EpisodeError
 from tpcd.parameters import LARGEST_FRICTION
-from tpcd.planar import transform_points
+from tpcd.planar import transform_points, wrap_angle
 from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
 from tpcd.simulator.record import START_DEPTH
 from tpcd.simulator.rest import distance_from_rest
@@ -184,6 +184,28 @@ def test_an_answer_that_something_else_has_moved_is_not_at_rest():
     for move in ((0, 1e-4, 0), (0, -1e-4, 0), (1e-4, 0, 0), (0, 0, 2e-3)):
         assert 0.9e-4 < off(settled.pose + vector(*move)) < 2e-4
     assert math.isinf(off(settled.pose + math.nan))
+    turn = vector(0, 0, 2 * math.pi)
+    assert off(settled.pose + turn) >= 2 * math.pi * float(BOX.norm(dim=-1).max())
+
+
+@ENGINES
+def test_an_object_that_turns_round_under_a_soft_spring_is_not_at_rest(engine):
+    """Pressed by kilonewtons, with springs about y that turn it for less than half a newton metre:
+    what is called converged has the wrench of the angle that is told, which is within half a turn
+    of the command."""
+    random = torch.Generator().manual_seed(0)
+    draws = torch.rand(60, 3, generator=random, dtype=torch.float64)
+    command = vector(-0.05, 0.05, -0.2) + vector(0.1, -0.2, 0.4) * draws
+    stiffness = vector(1e5, 1e5, 0.1)
+    scene = make_scene(BOX.expand(60, *BOX.shape))
+    start = vector(0, 0.1, 0).expand(60, 3)
+    found = simulate_step(scene, start, command, stiffness, engine=engine)
+    good = found.status <= StepStatus.START_INSIDE
+    assert 5 < good.sum() < 60
+    stretched = found.pose - command
+    stretched[:, 2] = wrap_angle(stretched[:, 2])
+    torch.testing.assert_close((stiffness * stretched)[good], found.wrench[good])
+    assert (found.residual[~good] > 1e-6).all()
 
 
 def test_a_scene_or_a_prior_with_more_friction_is_refused_with_the_bound(tmp_path):

@@ -179,7 +179,7 @@ def step_element(
             turn = (math.cos(pose[2]), math.sin(pose[2]))
             linear_system(world, o, law, part, pose, turn, space)
             if share == 1.0:
-                off = distance_from_rest(world, o, chains, law, extent, pose, turn, space)
+                off = distance_from_rest(world, o, chains, law, extent, part, pose, turn, space)
                 residual = max(residual, off)
                 if off > REST_TOLERANCE * law.tolerance:
                     status = max(status, NOT_CONVERGED)

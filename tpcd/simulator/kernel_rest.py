@@ -22,12 +22,13 @@ def depth_inside(world, o, chains, pose, load):
 
 @inner(error_model="numpy")
 @no_type_check
-def distance_from_rest(world, o, chains, law, extent, pose, turn, space):
-    """How far a settled pose, turned by `turn` (cos, sin), is from rest [m].
+def distance_from_rest(world, o, chains, law, extent, command, pose, turn, space):
+    """How far a settled pose, turned by `turn` (cos, sin), is from rest at a command [m].
 
     `linear_system` must be filled for the pose. Infinite where it is no number.
     """
-    system, worst, total = space.system, 0.0, 0.0
+    system, total = space.system, 0.0
+    worst = extent * 2.0 * math.pi * abs(round((pose[2] - command[2]) / (2.0 * math.pi)))
     for a in range(3):
         off = abs(system.unbalanced[a]) / law.stiffness[a]
         off = off if a < 2 else off * extent

@@ -40,7 +40,11 @@ class StepStatus(IntEnum):
         f"converged, but the start pose is more than {1e3 * START_DEPTH:g} mm inside a terrain, out"
         " of which the object was pushed first; check the frame and the unit of the pose",
     )
-    NOT_CONVERGED = 2, "the answer is not at rest, see its residual; raise rounds or substeps"
+    NOT_CONVERGED = (
+        2,
+        "the answer is not at rest, see its residual; raise rounds or substeps, or the stiffness"
+        " about y where the object turned round",
+    )
     RELAXED = 3, "jammed: no motion satisfies contact with friction; answered without friction"
     INVALID_INPUT = (
         4,

@@ -3,10 +3,14 @@
 At rest the object is inside no terrain, bears the load of what it touches alone, and the wrench
 K (x' - u) is the sum of the contact forces. How far an answer is from that is told as a length:
 what the forces do not balance by the way that the arm would still go for it, turns by the way of
-the furthest point of the outline. `kernel_rest` is the same in compiled loops.
+the furthest point of the outline. The arm knows angles to half a turn: where the object is turned
+further from its command, the spring pulls another way, and nothing rests. `kernel_rest` is the same
+in compiled loops.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from jaxtyping import Float
@@ -46,7 +50,10 @@ def distance_from_rest(
     frames = loaded_frames(scene, pose, contacts)
     slope = (contacts.side * scene.friction.gather(-1, contacts.terrain))[..., None]
     pushes = contacts.multiplier[..., None] * (frames.normal_row + slope * frames.tangent_row)
-    unbalanced = (pose - command - pushes.sum(-2) / stiffness).abs()
+    stretched = pose - command
+    turned = (stretched[:, 2] / (2 * math.pi)).round().abs() * (2 * math.pi)
+    unbalanced = (stretched - pushes.sum(-2) / stiffness).abs()
     extent = scene.points_ee.norm(dim=-1).amax(-1)
     off = off.maximum(unbalanced[:, :2].amax(-1)).maximum(unbalanced[:, 2] * extent)
+    off = off.maximum(turned * extent)
     return torch.where(torch.isfinite(off), off, torch.inf)

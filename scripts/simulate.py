@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from tpcd.cli import check_numbers, run
+from tpcd.numerals import NUMBER
 
 SCENE_STREAM, EPISODE_STREAM = 0, 1
 """Independent random streams, so that the scene depends on the seed alone."""
@@ -38,6 +39,8 @@ NOISE = {
     "noise_torque": ("tau",),
 }
 """What can make a row of the episode one that no recording has; noise of its columns only."""
+SPREAD = 0.2
+"""Part by which the prior of an object's scale may make it larger or smaller."""
 FILE_ENDINGS = (".csv", ".parquet", ".yaml", ".truth.csv", ".truth.yaml")
 """Of the files that an episode here can have."""
 
@@ -119,13 +122,32 @@ class Simulation:
         for text in self.effects:
             path, _, value = text.partition("=")
             effect, _, parameter = path.partition(".")
-            try:
-                found.setdefault(effect, {})[parameter] = float(value)
-            except ValueError as error:
-                raise ValueError(
-                    f"effects has {text!r}, expected EFFECT.PARAMETER=NUMBER"
-                ) from error
+            if not NUMBER.fullmatch(value) or not parameter:
+                raise ValueError(f"effects has {text!r}, expected EFFECT.PARAMETER=NUMBER")
+            if parameter in found.setdefault(effect, {}):
+                raise ValueError(f"effects has {path} twice, expected one number for it")
+            found[effect][parameter] = float(value)
         return found
+
+    def check_units(self, longest: float) -> None:
+        """Refuse what looks like another unit, for an object so long at scale 1 [m]; ValueError."""
+        import torch
+
+        from tpcd.contract import check_effect, check_stiffness
+        from tpcd.effects.catalogue import unit_of
+        from tpcd.shape.outline import LARGEST_SIZE, SMALLEST_SIZE
+
+        check_stiffness(torch.tensor(self.stiffness, dtype=torch.float64), insist="")
+        for effect, given in self.hidden.items():
+            for parameter, value in given.items():
+                check_effect(effect, parameter, value, unit_of(effect, parameter))
+        least, most = (1 - SPREAD) * SMALLEST_SIZE, (1 + SPREAD) * LARGEST_SIZE
+        if self.scale is not None and not least <= self.scale * longest <= most:
+            raise ValueError(
+                f"scale is {self.scale:g}, which makes the object {self.scale * longest:.3g} m"
+                f" long, expected {least:g} to {most:g} m: give the ratio of its size to the"
+                " outline's"
+            )
 
     def blamed(self, problem: str) -> str:
         """What the episode would have wrong, with the options in front that may have done it."""
@@ -135,6 +157,7 @@ class Simulation:
         given = [name for name in (*noise, *PHYSICAL) if getattr(self, name) != usual[name]]
         options = " and ".join(f"--{name}" for name in given or ("policy", "seed"))
         verb = "makes" if len(given) == 1 else "make"
+        problem = problem.partition("; convert it")[0]
         return f"{options} {verb} an episode that cannot be, {problem}; choose other values"
 
     def _value(self, name: str) -> float | None:
@@ -150,6 +173,7 @@ def simulate(config: Simulation) -> None:
     import sys
     from contextlib import ExitStack
 
+    import numpy as np
     import torch
 
     from tpcd.data.files import write_together
@@ -173,6 +197,7 @@ def simulate(config: Simulation) -> None:
         for file in [f"{stem}{ending}" for stem in names for ending in FILE_ENDINGS]:
             check_target(config.out / file, config.overwrite)
         outline = find_outline(config.outline, config.unit)
+        config.check_units(float(np.ptp(outline.vertices, axis=0).max()))
         given = {name: getattr(config, name) for name in SCENE_NAMES}
         scene = draw_scene(
             outline.name,

@@ -243,7 +243,27 @@ SIMULATE = {
     "unknown effect": ({"--effects": "foo.bar=1"}, "no effect 'foo'"),
     "unit of a name": ({"--unit": "mm"}, "unit is 'mm', expected none for 'mug', which is no file"),
     "file in the way": ({"--out": "cross.csv"}, "is a file"),
-    "scale of a house": ({"--scale": "1000"}, "error: --scale makes an episode that cannot be"),
+    "scale of a house": ({"--scale": "1000"}, "error: scale is 1000, which makes the object 1"),
+    "scale of a crumb": ({"--scale": "1e-6"}, "m long, expected 0.004 to 1.2 m: give the ratio"),
+    "friction of glue": ({"--friction": "1000"}, "error: friction is 1000, expected 0 to 100"),
+    "stiffness in N/mm": (
+        {"--stiffness": "0.1 100 50"},
+        "error: stiffness is 0.1, expected N/m (10 or more): it looks like N/mm; convert it",
+    ),
+    "compliance in mm/N": (
+        {"--effects": "floor_compliance.compliance=0.2"},
+        "floor_compliance.compliance is 0.2, expected m/N (at most 0.01): it looks like mm/N",
+    ),
+    "tilt in degrees": ({"--effects": "floor_tilt.angle=5"}, "expected rad (at most 1)"),
+    "step in millimetres": (
+        {"--effects": "floor_step.height=3 floor_step.x=0.05", "--truth": "mujoco"},
+        "floor_step.height is 3, expected m (at most 0.1): it looks like millimetres",
+    ),
+    "effect twice": (
+        {"--effects": "adhesion.force=1 adhesion.force=2"},
+        "effects has adhesion.force twice",
+    ),
+    "effect without its parameter": ({"--effects": "adhesion=1"}, "expected EFFECT.PARAMETER="),
     "force noise in mN": (
         {"--noise-force": "1e9"},
         "error: --noise_force makes an episode that cannot be, row 0 (line 2), column F_x",

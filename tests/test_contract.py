@@ -13,10 +13,12 @@ import pytest
 import torch
 from contact_scenes import STIFFNESS, make_scene, vector
 
+from eval.blind.suites import MEDIUM, OUTSIDE
 from tpcd.belief.belief import Belief, estimate
 from tpcd.belief.settings import EstimatorSettings, SamplerSettings
-from tpcd.contract import as_numbers, check_stiffness
+from tpcd.contract import as_numbers, check_effect, check_stiffness
 from tpcd.data import Episode, read_episode, write_episode
+from tpcd.effects.catalogue import KNOWN, unit_of
 from tpcd.errors import EpisodeError
 from tpcd.predict import ContactPredictor
 from tpcd.qp import ContactQP, solve
@@ -244,3 +246,26 @@ DOORS: dict[str, Callable[[], Any]] = {
 def test_what_is_no_scene_or_problem_is_a_type_error(door):
     with pytest.raises(TypeError, match="expected a Contact"):
         DOORS[door]()
+
+
+def test_effects_of_any_likely_size_are_taken_and_those_in_another_unit_refused() -> None:
+    for effect in KNOWN:
+        for parameter in effect.parameters:
+            for value in (parameter.low, parameter.high):
+                check_effect(effect.name, parameter.name, value, parameter.unit)
+    for name, sizes in {**MEDIUM, **OUTSIDE}.items():
+        for parameter, value in sizes.items():
+            check_effect(name, parameter, value, unit_of(name, parameter))
+    for name, parameter, value in (
+        ("wall_compliance", "compliance", 0.25),
+        ("grasp_compliance", "compliance", 5.7),
+        ("floor_tilt", "angle", 1.4),
+        ("floor_drift", "drift", 3.0),
+        ("wrench_reference_point", "x", 20.0),
+        ("floor_bump", "height", 3.0),
+        ("adhesion", "force", 1000.0),
+        ("command_lag", "share", 30.0),
+        ("force_gain", "gain", float("nan")),
+    ):
+        with pytest.raises(ValueError, match=f"{name}.{parameter} is .*, expected"):
+            check_effect(name, parameter, value, unit_of(name, parameter))

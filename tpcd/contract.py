@@ -25,6 +25,20 @@ LEAST_STIFFNESS, LARGEST_STIFFNESS = 10.0, 1e6
 stiffer."""
 LARGEST_TURNING_STIFFNESS = 1e4
 """The same about its axis [N·m/rad]; stiffer ones are taken for N·mm/rad."""
+LARGEST_AMOUNTS = {
+    "m": (0.1, "millimetres"),
+    "rad": (1.0, "degrees"),
+    "N": (500.0, "millinewtons"),
+    "N·m": (50.0, "N·mm"),
+    "m/N": (0.01, "mm/N"),
+    "rad/(N·m)": (3.0, "degrees/(N·m)"),
+    "1/m": (200.0, "another unit"),
+    "1": (10.0, "percent"),
+}
+"""Sizes of effects beyond which they are taken for another unit; a terrain that yields by 0.01 m/N
+is as soft as a soft arm."""
+PLACES = ("x", "z", "place", "lever", "length", "width")
+"""Parameters of effects in metres that are no sizes but places: at most `LARGEST_LENGTH`."""
 INSIST = "or insist with unusual=True (in a YAML unusual: true, in an import --unusual)"
 
 
@@ -82,9 +96,27 @@ def check_pose(name: str, value: Float[Tensor, "*batch 3"], unusual: bool = Fals
             )
 
 
-def check_stiffness(value: Float[Tensor, "*batch 3"], unusual: bool = False) -> None:
+def check_effect(name: str, parameter: str, value: float, unit: str) -> None:
+    """Refuse a parameter of an effect that is not finite, or looks like another unit;
+    ValueError."""
+    limit, likely = LARGEST_AMOUNTS.get(unit, (math.inf, ""))
+    if unit == "m" and parameter in PLACES:
+        limit = LARGEST_LENGTH
+    if not math.isfinite(value):
+        raise ValueError(f"{name}.{parameter} is {value}, expected a finite number")
+    if abs(value) > limit:
+        shown = "a plain number" if unit == "1" else unit
+        raise ValueError(
+            f"{name}.{parameter} is {value:g}, expected {shown} (at most {limit:g}): it looks like"
+            f" {likely}; convert it"
+        )
+
+
+def check_stiffness(
+    value: Float[Tensor, "*batch 3"], unusual: bool = False, insist: str = f", {INSIST}"
+) -> None:
     """Refuse stiffness along x, z [N/m] and about y [N·m/rad] that is not positive and finite, or
-    that looks like N/mm or N·mm/rad; ValueError."""
+    that looks like N/mm or N·mm/rad; ValueError, which says how to `insist`."""
     right = (value > 0) & torch.isfinite(value)
     if not bool(right.all()):
         raise ValueError(f"stiffness is {value.tolist()}, expected three positive finite numbers")
@@ -103,4 +135,4 @@ def check_stiffness(value: Float[Tensor, "*batch 3"], unusual: bool = False) -> 
         fault = f"{turning:g}, expected N·m/rad (at most {limit:g}): it looks like N·mm/rad"
     else:
         return
-    raise ValueError(f"stiffness is {fault}; convert it, {INSIST}")
+    raise ValueError(f"stiffness is {fault}; convert it{insist}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-MARKS = (".", ",")
+MARKS: tuple[str, str] = (".", ",")
 OTHER = {".": ",", ",": "."}
 _FRACTION = {".": r"(\.\d*)?", ",": r"(,\d+)?"}
 WRITTEN = {
@@ -65,7 +65,8 @@ def decimal_mark(only: dict[str, int], either: dict[str, int], usual: str | None
 
 def marks_shown(cells: Iterable[str]) -> tuple[dict[str, int], dict[str, int]]:
     """Of some cells, what `decimal_mark` asks for."""
-    only, either = dict.fromkeys(MARKS, 0), dict.fromkeys(MARKS, 0)
+    only: dict[str, int] = dict.fromkeys(MARKS, 0)
+    either: dict[str, int] = dict.fromkeys(MARKS, 0)
     for cell in cells:
         point, comma = has_mark(cell, "."), has_mark(cell, ",")
         if point != comma:

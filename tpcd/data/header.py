@@ -88,11 +88,14 @@ def parse_header(content: Any, path: Path) -> Header:
     if not isinstance(unusual, bool):
         raise EpisodeError(path, f"unusual is {unusual!r}, expected true or false", "leave it out")
     try:
-        check_stiffness(torch.tensor(stiffness, dtype=torch.float64), unusual)
+        check_stiffness(
+            torch.tensor(stiffness, dtype=torch.float64),
+            unusual,
+            ", or insist with unusual: true",
+        )
     except ValueError as error:
         fault, _, remedy = str(error).partition("; ")
-        insist = "convert it, or insist with unusual: true" if remedy else ""
-        raise EpisodeError(path, fault, insist) from error
+        raise EpisodeError(path, fault, remedy) from error
     sensor_std = _sensor_std(path, content["sensor_std"]) if "sensor_std" in content else None
     time_step = content.get("time_step_s")
     if time_step is not None:

@@ -27,3 +27,11 @@ def find_effect(name: str, effects: Iterable[Effect] = KNOWN) -> Effect:
     if name not in known:
         raise ValueError(f"no effect {name!r}; expected one of {', '.join(sorted(known))}")
     return known[name]
+
+
+def unit_of(name: str, parameter: str) -> str:
+    """SI unit of a parameter of an effect, also of those that MuJoCo alone can be given; "" where
+    there is none of the name."""
+    units = {(effect.name, one.name): one.unit for effect in KNOWN for one in effect.parameters}
+    others = {"height": "m", "x": "m", "length": "m", "skew": "1", "slope": "1/m"}
+    return units.get((name, parameter), others.get(parameter, ""))

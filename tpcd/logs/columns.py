@@ -268,11 +268,10 @@ def _column_and_unit(text: str, columns: Mapping[str, object]) -> tuple[str, str
 def _find(column: str, columns: Columns, path: Path) -> None:
     if column in columns:
         return
-    for name in (column, column.rpartition("_")[0]) if isinstance(columns, Table) else ():
-        if name in columns.refused:
-            odd = columns.refused[name]
-            raise LogError(path, f"column {name!r} {odd.problem} in {place(columns, odd.row)}",
-                           "export it again, or leave it out of the map")  # fmt: skip
+    refused = columns.refused if isinstance(columns, Table) else {}
+    if odd := refused.get(column) or refused.get(column.rpartition("_")[0]):
+        told = f"column {odd.name!r} {odd.problem} in {place(columns, odd.row)}"
+        raise LogError(path, told, "export it again, or leave it out of the map")
     close = difflib.get_close_matches(column, list(columns), 1, 0.6)
     remedy = f"did you mean {close[0]!r}?" if close else f"the columns are {_listed(columns)}"
     raise LogError(path, f"no column {column!r}", remedy)

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from command_calls import PRIOR, load_script
 from made_logs import Setting, an_episode, in_space, sampled, write_csv
+from made_tables import IIWA, IIWA_MAP
 from matplotlib.image import imread
-from test_import_tables import IIWA, IIWA_MAP
 
 from tpcd.cli import run
 from tpcd.data import read_episode

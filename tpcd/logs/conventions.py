@@ -73,6 +73,8 @@ class Change:
     cost: float
     """Minus the logarithm of its prior odds: how rarely it is mistaken."""
     apply: Callable[[AtRest], AtRest]
+    of_stiffness: bool = False
+    """Whether it says that the stiffness is another."""
 
 
 def changes_of(log: Log, wrench: WrenchReading, rotation: RotationReading) -> list[Change]:
@@ -200,12 +202,13 @@ def _of_units(log: Log) -> list[Change]:
         Change("length", "positions look like millimetres", _with_unit(log, places, "mm"),
                3.0, lambda rest: _stretched(rest, 1e-3)),
         Change("length", "the stiffness is 1000 times too large", "check --stiffness", 3.5,
-               lambda rest: replace(rest, stiffness=rest.stiffness * [1e-3, 1e-3, 1.0])),
+               lambda rest: replace(rest, stiffness=rest.stiffness * [1e-3, 1e-3, 1.0]), True),
         Change("length", "the stiffness is in N/mm", "give --stiffness in N/m, 1000 times as much",
-               3.5, lambda rest: replace(rest, stiffness=rest.stiffness * [1e3, 1e3, 1.0])),
+               3.5, lambda rest: replace(rest, stiffness=rest.stiffness * [1e3, 1e3, 1.0]), True),
         Change("unit of angles", "the stiffness about the angle is in N·m/deg",
                "give --stiffness in N·m/rad, 57.3 times as much", 5.0,
-               lambda rest: replace(rest, stiffness=rest.stiffness * [1.0, 1.0, 180 / math.pi])),
+               lambda rest: replace(
+                   rest, stiffness=rest.stiffness * [1.0, 1.0, 180 / math.pi]), True),
         Change("force", "forces are in millinewtons", _with_unit(log, forces, "mN"),
                4.0, lambda rest: _weighed(rest, (1e-3, 1.0))),
         Change("force", "forces and torques are in mN and mN·m",
@@ -214,6 +217,26 @@ def _of_units(log: Log) -> list[Change]:
         Change("force", "torques are in N·mm", _with_unit(log, torques, "Nmm"), 4.0,
                lambda rest: _weighed(rest, (1.0, 1e-3))),
     ]  # fmt: skip
+
+
+def factor_of_stiffness(
+    stated: Float[np.ndarray, " 3"], found: Float[np.ndarray, " 3"], cost: float
+) -> Change:
+    """The stiffness that forces and torque show, where it is not the one stated."""
+    told = [
+        f"{found[k] / stated[k]:.3g} times as large {where}"
+        for k, where in enumerate(("along x", "along z", "about the angle's axis"))
+        if found[k] != stated[k]
+    ]
+    given = " ".join(f"{value:.3g}" for value in found)
+    return Change(
+        "factor",
+        f"the stiffness is {', '.join(told)}, as it was stated (or the sensor's gain is)",
+        f"--stiffness {given} if the controller's was so, else scale the wrench by the inverse",
+        cost,
+        lambda rest: replace(rest, stiffness=found),
+        of_stiffness=True,
+    )
 
 
 def torque_about(rest: AtRest, point: Float[np.ndarray, " 3"]) -> AtRest:

@@ -11,6 +11,7 @@ The wrench of a sensor at p, moved to the end-effector origin o, is (F, T + (p -
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -42,7 +43,7 @@ class Plane:
         if not lengths or abs(x @ z) > 1e-3 * lengths:
             raise ValueError(f"plane_x {self.x} and plane_z {self.z}, expected right angles")
 
-    @property
+    @cached_property
     def directions(self) -> Float[np.ndarray, "3 3"]:
         """Rows x, z, and the axis of the angle, as unit vectors of the world."""
         x, z = np.array(self.x, dtype=float), np.array(self.z, dtype=float)
@@ -84,19 +85,54 @@ class PlanarLog:
     """Force out of the plane, and torque about x and z [N, N·m, N·m]."""
     findings: tuple[Finding, ...] = ()
     """What checks of the recording found, by `times`."""
+    command_swing: Float[np.ndarray, " n"] | None = None
+    """Rotation of the set points that is not about the plane's axis [rad]."""
 
 
-def project(log: Log, plane: Plane, wrench: WrenchReading) -> PlanarLog:
-    """Bring a recording into the plane; raises `LogError` where a component is missing."""
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """n poses and set points in the plane, as in `PlanarLog`."""
+
+    poses: Float[np.ndarray, "n 3"]
+    commands: Float[np.ndarray, "n 3"] | None
+    left_out: Float[np.ndarray, "n 2"]
+    command_swing: Float[np.ndarray, " n"] | None
+    """Rotation of the set points that is not about the plane's axis [rad]."""
+
+
+def project(
+    log: Log, plane: Plane, wrench: WrenchReading, motion: Motion | None = None
+) -> PlanarLog:
+    """Bring a recording into the plane; raises `LogError` where a component is missing.
+
+    `motion` is its `motion_in_plane` where that is known already.
+    """
+    _check_components(log, plane.directions, wrench)
+    motion = motion_in_plane(log, plane) if motion is None else motion
     directions = plane.directions
-    _check_components(log, directions, wrench)
-    axis = directions[2]
     offset = np.array(wrench.offset)
     force, torque = log.forces - offset[:3], log.torques - offset[3:]
     if wrench.frame == "tool":
         force, torque = log.rotations.apply(force), log.rotations.apply(torque)
     force, torque = wrench.sign * force, wrench.sign * wrench.torque_sign * torque
-    torque = torque + np.cross(log.rotations.apply(np.array(wrench.point)), force)
+    if any(wrench.point):
+        torque = torque + np.cross(log.rotations.apply(np.array(wrench.point)), force)
+    return PlanarLog(
+        log.times,
+        motion.poses,
+        np.column_stack((force @ directions[:2].T, torque @ directions[2])),
+        motion.commands,
+        motion.left_out,
+        np.column_stack((force @ directions[2], torque @ directions[:2].T)),
+        log.findings,
+        motion.command_swing,
+    )
+
+
+def motion_in_plane(log: Log, plane: Plane) -> Motion:
+    """Poses and set points in the plane; raises `LogError` where `tool_x` is not in it."""
+    directions = plane.directions
+    axis = directions[2]
     place = (log.positions - np.array(plane.origin)) @ directions.T
     start = log.rotations[0]
     angle, swing = _turn(log.rotations, start, axis)
@@ -110,19 +146,16 @@ def project(log: Log, plane: Plane, wrench: WrenchReading) -> PlanarLog:
                 "name a direction of the end effector that lies in the plane",
             )
         zero = float(np.arctan2(pointing[1], pointing[0]))
-    commands = None
+    commands = command_swing = None
     if log.command_positions is not None and log.command_rotations is not None:
         target = (log.command_positions - np.array(plane.origin)) @ directions.T
-        turned, _ = _turn(log.command_rotations, start, axis)
+        turned, command_swing = _turn(log.command_rotations, start, axis)
         commands = np.column_stack((target[:, :2], np.unwrap(turned) + zero))
-    return PlanarLog(
-        log.times,
+    return Motion(
         np.column_stack((place[:, :2], np.unwrap(angle) + zero)),
-        np.column_stack((force @ directions[:2].T, torque @ axis)),
         commands,
         np.column_stack((place[:, 2] - place[0, 2], swing)),
-        np.column_stack((force @ axis, torque @ directions[:2].T)),
-        log.findings,
+        command_swing,
     )
 
 
@@ -130,12 +163,16 @@ def _turn(
     rotations: Rotation, start: Rotation, axis: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Turn about an axis of the world since the start, and the angle of what is left [rad]."""
-    since = rotations * start.inv()
-    quaternions = since.as_quat()
-    angle = 2.0 * np.arctan2(quaternions[:, :3] @ axis, quaternions[:, 3])
+    quaternions = (rotations * start.inv()).as_quat()
+    about = quaternions[:, :3] @ axis
+    angle = 2.0 * np.arctan2(about, quaternions[:, 3])
     angle = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
-    left = since * Rotation.from_rotvec(-angle[:, None] * axis)
-    return angle, left.magnitude()
+    # Of the rest, a turn about an axis at right angles, the scalar part is the length of these two.
+    swing = 2.0 * np.arctan2(
+        np.linalg.norm(quaternions[:, :3] - about[:, None] * axis, axis=1),
+        np.hypot(about, quaternions[:, 3]),
+    )
+    return angle, swing
 
 
 def _check_components(

@@ -17,15 +17,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from tpcd.logs.conventions import AtRest, Change, RotationReading, changes_of, torque_about
+from tpcd.logs.conventions import (
+    AtRest,
+    Change,
+    RotationReading,
+    changes_of,
+    factor_of_stiffness,
+    torque_about,
+)
 from tpcd.logs.log import Log, LogError
-from tpcd.logs.plane import Plane, WrenchReading, project
+from tpcd.logs.plane import Motion, Plane, WrenchReading, motion_in_plane, project
 from tpcd.logs.settled import Settled
 from tpcd.quality.lever import depth_of_contact
 
@@ -49,6 +55,15 @@ FELT = 1.0
 FARTHEST_POINT = 1.0
 """Torques are taken about no point farther from the end effector [m]."""
 BEYOND_NOISE = 3.0
+GOOD = 0.1
+"""Factors of the stiffness nearer to 1 (in logarithms) are those of arms and sensors as they are:
+only their product shows."""
+SPREAD = 0.7
+"""One standard deviation of the logarithm of a factor that was mistaken,"""
+LARGEST = 30.0
+"""and the largest one: what is larger is a unit."""
+COST = 3.0
+"""Minus the logarithm of the prior odds that some stiffness was stated wrongly."""
 WITHIN = -5.0
 """Depth of contact in standard errors from which forces act from within the object."""
 RARELY_WITHIN = 5.5
@@ -63,6 +78,8 @@ class Reading:
     changes: tuple[Change, ...]
     rows: Float[np.ndarray, "k 9"]
     """Planar pose, command and wrench of the settled samples."""
+    stiffness: Float[np.ndarray, " 3"]
+    """[N/m, N/m, N·m/rad]"""
     left: dict[str, float]
     """Part of force, torque and rotation that is left, of those that show anything."""
     likelihood: float
@@ -143,13 +160,10 @@ def compare(
     )
     rest = AtRest(zeroed, replace(wrench, offset=(0.0,) * 6), stiffness, np.ones(2))
     judge = _Judge(replace(plane, tool_x=None), rest, settled.noise)
-    own = judge.reading(())
-    if own is None:
+    found = judge.all_of(changes_of(log, wrench, rotation))
+    if not found:
         return None
-    changes = changes_of(log, wrench, rotation)
-    found = [own, *judge.all_of(changes)]
-    tried = [own, *(reading for reading in _best(found, 4) if reading.changes)]
-    found += [each for r in tried if (each := judge.about_point(r)) is not None]
+    own = found[0]
     # What makes all forces vanish explains nothing.
     found = [reading for reading in found if set(own.left) <= set(reading.left)]
     fitting = [reading for reading in found if reading.fits]
@@ -164,7 +178,7 @@ def compare(
         for r in found
         if own.fits
         and not better
-        and [change.subject for change in r.changes] not in ([], ["point"])
+        and [change.subject for change in r.changes] not in ([], ["point"], ["factor"])
         and len(r.changes) == 1
         and abs(r.likelihood - own.likelihood) < 1.0
         and not same_episode(r, own)
@@ -174,6 +188,8 @@ def compare(
 
 def same_episode(first: Reading, second: Reading) -> bool:
     """Whether two readings make one episode, but for where angles are zero."""
+    if (np.abs(np.log(first.stiffness / second.stiffness)) > TOLERANCE).any():
+        return False
     parts = []
     for reading in (first, second):
         rows = reading.rows.copy()
@@ -193,61 +209,143 @@ class _Judge:
         sizes = TOLERANCE * np.array([force, force, torque])
         self.floor = np.hypot(noise[3:], sizes) + 1e-6
         self.turned = _turned(rest.log.rotations)
+        self._turned: tuple[Log, Motion, float] | None = None
+        """The last recording, its motion in the plane, and how far it turned."""
 
     def all_of(self, changes: Sequence[Change]) -> list[Reading]:
-        """Every hypothesis of one to `MOST_CHANGES` changes that can be made; of two at most where
-        one is of the many ways in which axes may be named."""
-        found = []
-        for count in range(1, MOST_CHANGES + 1):
-            for some in combinations(changes, count):
-                subjects = {change.subject for change in some}
-                if len(subjects) == count and (count < 3 or "axes" not in subjects):
-                    found.append(self.reading(some))
-        return [reading for reading in found if reading is not None]
+        """Hypotheses of ever more changes, `MOST_CHANGES` at most, until one leaves no more than
+        arms and sensors as they are do: what is simpler is said first.
 
-    def reading(self, changes: tuple[Change, ...]) -> Reading | None:
-        """What is left under some changes; None where the recording does not allow them."""
-        rest = self.rest
-        for change in changes:
-            rest = change.apply(rest)
+        Axes may be named in so many ways that they are changed with one more thing at most. Each
+        is held against the springs with factors of the stiffness too, and the best ones with
+        torques about another point.
+        """
+        found = self.readings((), self.rest)
+        if not found:
+            return []
+        moved: list[Reading] = []
+        begun: list[tuple[tuple[Change, ...], AtRest, int]] = [((), self.rest, 0)]
+        for count in range(1, MOST_CHANGES + 1):
+            level, begun = begun, []
+            for some, rest, first in level:
+                for k, change in enumerate(changes[first:], first + 1):
+                    both = (*some, change)
+                    subjects = {each.subject for each in both}
+                    if len(subjects) == count and (count < 3 or "axes" not in subjects):
+                        made = change.apply(rest)
+                        found += self.readings(both, made)
+                        begun.append((both, made, k))
+            tried = [found[0], *(reading for reading in _best(found, 4) if reading.changes)]
+            moved = [each for reading in tried for each in self.about_point(reading)]
+            best = _best([*found, *moved], 1)[0]
+            if max(best.left.values(), default=0.0) <= 2 * TOLERANCE:
+                break
+        return found + moved
+
+    def readings(self, changes: tuple[Change, ...], rest: AtRest) -> list[Reading]:
+        """What is left under changes that made `rest`, and with factors of the stiffness too; none
+        where the recording does not allow them."""
         try:
-            planar = project(rest.log, self.plane, rest.wrench)
+            planar = project(rest.log, self.plane, rest.wrench, self._motion(rest.log)[0])
         except LogError:
-            return None
+            return []
         assert planar.commands is not None
-        expected = _spring(planar.poses, planar.commands, rest.stiffness)
         rows = np.column_stack((planar.poses, planar.commands, planar.wrenches))
-        wrong = planar.wrenches - expected
+        found = [self._scored(changes, rest, rows, planar.motion_left_out[:, 1])]
+        if len(changes) < MOST_CHANGES and not any(each.of_stiffness for each in changes):
+            factor = self._factors(rest, rows)
+            if factor is not None:
+                stiffer, cost = factor
+                made = replace(rest, stiffness=stiffer)
+                change = factor_of_stiffness(rest.stiffness, stiffer, cost)
+                swing = planar.motion_left_out[:, 1]
+                found.append(self._scored((*changes, change), made, rows, swing))
+        return found
+
+    def _motion(self, log: Log) -> tuple[Motion, float]:
+        """Motion in the plane, which is the same in most hypotheses that are made in a row."""
+        last = self._turned
+        if (
+            last is None
+            or last[0].positions is not log.positions
+            or last[0].command_positions is not log.command_positions
+            or last[0].rotations is not log.rotations
+            or last[0].command_rotations is not log.command_rotations
+        ):
+            last = self._turned = (log, motion_in_plane(log, self.plane), _turned(log.rotations))
+        return last[1:]
+
+    def _scored(
+        self,
+        changes: tuple[Change, ...],
+        rest: AtRest,
+        rows: Float[np.ndarray, "k 9"],
+        swing: Float[np.ndarray, " k"],
+    ) -> Reading:
+        expected = _spring(rows[:, :3], rows[:, 3:6], rest.stiffness)
+        wrenches, turn = rows[:, 6:], self._motion(rest.log)[1]
+        squares = ((wrenches - expected) ** 2).mean(0)
+        told, springs = (wrenches**2).mean(0), (expected**2).mean(0)
         scale = rest.scale[[0, 0, 1]]
-        k = len(wrong)
-        likelihood = -0.5 * k * np.log((wrong**2).mean(0) / scale**2 + self.floor**2).sum()
-        swing, turned = planar.motion_left_out[:, 1], rest.log.rotations
-        turn = _turned(turned)
-        likelihood -= (
-            0.5 * SWINGS * math.log(_size(swing) ** 2 + LEAST_TURN**2 + (TOLERANCE * turn) ** 2)
-        )
+        likelihood = -0.5 * len(rows) * np.log(squares / scale**2 + self.floor**2).sum()
+        swung = float((swing**2).mean())
+        likelihood -= 0.5 * SWINGS * math.log(swung + LEAST_TURN**2 + (TOLERANCE * turn) ** 2)
         left = {}
+        least, noise = (rest.stiffness * self.noise[:3]) ** 2, (scale * self.noise[3:]) ** 2
         for name, part in (("force", slice(0, 2)), ("torque", slice(2, 3))):
-            sizes = _size(expected[:, part]), _size(planar.wrenches[:, part])
-            least = _size((rest.stiffness * self.noise[:3])[part][None])
-            told = _size((scale * self.noise[3:])[part][None])
-            if max(sizes) > (FELT if name == "force" else 0.0) and (
-                sizes[0] > BEYOND_NOISE * least or sizes[1] > BEYOND_NOISE * told
-            ):
-                left[name] = _size(wrong[:, part]) / max(sizes)
+            sizes = np.sqrt([springs[part].sum(), told[part].sum()])
+            floors = BEYOND_NOISE * np.sqrt([least[part].sum(), noise[part].sum()])
+            if sizes.max() > (FELT if name == "force" else 0.0) and (sizes > floors).any():
+                left[name] = float(np.sqrt(squares[part].sum()) / sizes.max())
         if turn > LEAST_TURN:
-            left["rotation"] = _size(swing) / turn
-        depth, error = depth_of_contact(
-            planar.wrenches, planar.poses[:, 2], float(scale[2] * self.noise[5])
-        )
+            left["rotation"] = math.sqrt(swung) / turn
+        depth, error = depth_of_contact(wrenches, rows[:, 2], float(scale[1] * self.noise[5]))
         if depth < WITHIN * error:
             likelihood -= RARELY_WITHIN
-        return Reading(changes, rows, left, float(likelihood), depth / error)
+        return Reading(changes, rows, rest.stiffness, left, float(likelihood), depth / error)
 
-    def about_point(self, reading: Reading) -> Reading | None:
-        """The reading with torques about the point that fits them best; None where they fit."""
+    def _factors(
+        self, rest: AtRest, rows: Float[np.ndarray, "k 9"]
+    ) -> tuple[Float[np.ndarray, " 3"], float] | None:
+        """The stiffness that fits the rows best and what it costs; None where it is as stated.
+
+        Least squares of w = g K (x - u) + f s for each channel, with the direction s of the last
+        motion against which friction of the arm holds: that must not pass for a factor g.
+        """
+        expected = _spring(rows[:, :3], rows[:, 3:6], rest.stiffness)
+        scale, count = rest.scale[[0, 0, 1]], len(rows)
+        against = _directions(rows[:, :3], self.noise[:3])
+        stiffness, cost = rest.stiffness.copy(), 0.0
+        for c in range(3):
+            spring, wrench = expected[:, c], rows[:, 6 + c]
+            least = rest.stiffness[c] * self.noise[c], scale[c] * self.noise[3 + c]
+            if math.sqrt(float((spring**2).mean())) < BEYOND_NOISE * max(least):
+                continue
+            held = against[:, c] @ against[:, c]
+            beside = [
+                each - against[:, c] * (against[:, c] @ each / held if held else 0.0)
+                for each in (spring, wrench)
+            ]
+            size = float(beside[0] @ beside[0])
+            factor = float(beside[0] @ beside[1]) / size if size else 0.0
+            if not 1.0 / LARGEST < factor < LARGEST:
+                continue
+            stated, fitted = (
+                float(((beside[1] - g * beside[0]) ** 2).mean()) / scale[c] ** 2
+                + self.floor[c] ** 2
+                for g in (1.0, factor)
+            )
+            away = abs(math.log(factor))
+            error = scale[c] * math.sqrt(fitted * count / (max(count - 2, 1) * size)) / factor
+            own = 0.5 * math.log(count) + 0.5 * (away / SPREAD) ** 2
+            if away > GOOD + 2.0 * error and 0.5 * count * math.log(stated / fitted) > own:
+                stiffness[c], cost = factor * stiffness[c], cost + own
+        return None if np.array_equal(stiffness, rest.stiffness) else (stiffness, COST + cost)
+
+    def about_point(self, reading: Reading) -> list[Reading]:
+        """The reading with torques about the point that fits them best; none where they fit."""
         if reading.left.get("torque", 0.0) < 2 * TOLERANCE or len(reading.rows) < 6:
-            return None
+            return []
         rest = self.rest
         for change in reading.changes:
             rest = change.apply(rest)
@@ -258,7 +356,7 @@ class _Judge:
         moved, *_ = np.linalg.lstsq(lever, expected - reading.rows[:, 8], rcond=0.05)
         point = np.array(rest.wrench.point) + moved
         if np.linalg.norm(point) > FARTHEST_POINT:
-            return None
+            return []
         told = " ".join(f"{value:.3g}" for value in point)
         change = Change(
             "point",
@@ -267,14 +365,24 @@ class _Judge:
             5.0 + math.log(len(reading.rows)),
             lambda rest: torque_about(rest, point),
         )
-        return self.reading((*reading.changes, change))
+        return self.readings((*reading.changes, change), change.apply(rest))
 
     def gain(self, reading: Reading) -> Float[np.ndarray, " 3"]:
-        """How many times K (x - u) each channel of the wrench is; NaN where that is all zero."""
+        """How many times K (x - u) each channel is; NaN where that is all zero."""
         rows = reading.rows
         expected = _spring(rows[:, :3], rows[:, 3:6], self.rest.stiffness)
         with np.errstate(invalid="ignore", divide="ignore"):
             return (rows[:, 6:] * expected).sum(0) / (expected**2).sum(0)
+
+
+def _directions(
+    poses: Float[np.ndarray, "k 3"], noise: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Which way each coordinate moved last; 0 before it ever did."""
+    moved = np.diff(poses, axis=0, prepend=poses[:1])
+    far = np.abs(moved) > BEYOND_NOISE * math.sqrt(2.0) * noise
+    last = np.maximum.accumulate(np.where(far, np.arange(len(poses))[:, None], 0))
+    return np.sign(np.take_along_axis(np.where(far, moved, 0.0), last, axis=0))
 
 
 def _much_better(best: Reading, own: Reading) -> bool:

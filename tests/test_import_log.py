@@ -116,8 +116,8 @@ def test_wrong_stiffness_is_no_matter_of_signs() -> None:
         import_log(log_of(TURNED, SAMPLES), replace(choices, stiffness=(1e5, 1e5, 50.0)))
     doubts = import_log(log_of(TURNED, SAMPLES), choices).account.doubts
     (doubt,) = (each for each in doubts if each.kind == "convention")
-    assert "frame or unit of rotations and wrench fits" in str(doubt)
-    assert "F_x, F_z and tau are 0.1, 0.1, 1 times it; check stiffness" in str(doubt)
+    assert "the stiffness is not what was stated but 0.1 (± " in str(doubt)
+    assert "--stiffness 100 100 50" in str(doubt) and "invert" not in str(doubt)
     assert doubt.weight is Weight.SERIOUS
 
 

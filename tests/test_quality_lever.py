@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
 
+from tpcd.data.episode import Episode
 from tpcd.quality.lever import depth_of_contact
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.truth.recording import make_motion, record
@@ -15,12 +18,18 @@ OBJECTS = ("soup_can", "phone", "pear", "hammer", "mug", "cordless_drill")
 STD = (0.03, 0.03, 0.002)
 
 
-def standard_errors(name: str, seed: int, sign: float = 1.0) -> float:
-    """Depth of contact in standard errors, of a noisy recording of a diagnosis motion."""
+@cache
+def recorded(name: str, seed: int) -> Episode:
+    """A recording of a diagnosis motion."""
     generator = torch.Generator().manual_seed(seed)
     scene = draw_scene(name, builtin_outlines()[name].vertices, generator)
-    motion = make_motion("diagnosis", scene, 30, generator)
-    made = record(make_truth(scene, "quasistatic"), scene, motion, 30, generator).true
+    motion = make_motion("diagnosis", scene, 24, generator)
+    return record(make_truth(scene, "quasistatic"), scene, motion, 24, generator).true
+
+
+def standard_errors(name: str, seed: int, sign: float = 1.0) -> float:
+    """Depth of contact in standard errors, of a noisy recording of a diagnosis motion."""
+    made = recorded(name, seed)
     noise = np.random.default_rng(seed).normal(0.0, STD, (len(made), 3))
     wrenches = (made.wrenches.numpy() + noise) * [1.0, 1.0, sign]
     depth, error = depth_of_contact(wrenches, sign * made.poses[:, 2].numpy(), STD[2])

@@ -220,19 +220,23 @@ def _of_units(log: Log) -> list[Change]:
 
 
 def factor_of_stiffness(
-    stated: Float[np.ndarray, " 3"], found: Float[np.ndarray, " 3"], cost: float
+    stated: Float[np.ndarray, " 3"],
+    factors: Float[np.ndarray, " 3"],
+    errors: Float[np.ndarray, " 3"],
+    cost: float,
 ) -> Change:
-    """The stiffness that forces and torque show, where it is not the one stated."""
+    """The stiffness that forces and torque show, `factors` times the stated one; 1 where it is."""
+    found = stated * factors
     told = [
-        f"{found[k] / stated[k]:.3g} times as large {where}"
+        f"{factors[k]:.3g} (± {errors[k]:.1g}) times it {where}"
         for k, where in enumerate(("along x", "along z", "about the angle's axis"))
-        if found[k] != stated[k]
+        if factors[k] != 1.0
     ]
     given = " ".join(f"{value:.3g}" for value in found)
     return Change(
         "factor",
-        f"the stiffness is {', '.join(told)}, as it was stated (or the sensor's gain is)",
-        f"--stiffness {given} if the controller's was so, else scale the wrench by the inverse",
+        f"the stiffness is not what was stated but {', '.join(told)} (or the sensor's gain is)",
+        f"--stiffness {given} if that is the controller's, else divide the wrench by its gain",
         cost,
         lambda rest: replace(rest, stiffness=found),
         of_stiffness=True,

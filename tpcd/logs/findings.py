@@ -39,9 +39,11 @@ LEAST_PRESSED, PRESSED_ALIKE = 0.2, 0.5
 LEAST_ZEROED = 2
 """Rows that show a zero taken in contact."""
 NOTHING_FELT = "K (x - u) is nowhere more than 1 N: no contact is felt"
-LEFT_OVER = 0.15
-"""Part of a channel that K (x - u) does not explain from which it is doubted: sensors are off by
-some percent, friction of an arm by more."""
+SURE = 5.0
+"""Standard errors from which a cause is told: by chance in one of a thousand recordings."""
+LARGE = 0.1
+"""Part of the load of a channel below which it is arms and sensors as they are."""
+CHANNELS, UNITS = ("F_x", "F_z", "tau"), ("N", "N", "N·m")
 
 
 @dataclass(frozen=True)
@@ -114,20 +116,18 @@ def account_of(read: Readings | None, log: Log) -> Account:
             )
             remedy = "map it: u_qx u_qy u_qz u_qw, u_rx u_ry u_rz, u_e1 u_e2 u_e3 or u_phi"
             return account + Account((), (doubt("convention", told, remedy, serious=True),))
-        gain = ", ".join(f"{value:.2g}" for value in read.gain)
+        causes = _causes(read)
         told = (
             "no order, sense, sign, frame or unit of rotations and wrench fits K (x - u):"
-            f" it leaves {_left(own)} over {rows} rows; F_x, F_z and tau are {gain} times it"
+            f" it leaves {_left(own)} over {rows} rows" + "".join(f"; {each}" for each in causes)
         )
         remedy = "check stiffness, plane and units, and which columns are mapped"
         return account + Account((), (doubt("convention", told, remedy, serious=True),))
-    if max(own.left.values(), default=0.0) > LEFT_OVER:
-        told = (
-            f"K (x - u) leaves {_left(own)} unexplained over {rows} rows: friction of the arm, a"
-            " stiffness that is another, a gain, a drift, or a channel that saturates"
-        )
+    if causes := _causes(read):
+        told = f"the wrench is not K (x - u) over {rows} rows: {'; '.join(causes)}"
         remedy = "look at the panels against K (x - u), and run scripts/check.py --stiffness"
         account += Account((), (doubt("parity", told, remedy),))
+    account += _friction(read)
     if own.depth < WITHIN:
         told = (
             "forces would act from within the object: by their torques the hand lies beyond the"
@@ -183,6 +183,48 @@ def _looks_otherwise(read: Readings) -> Finding:
     lost = max(own.left.get(name, 0.0) for name in ("force", "torque", "rotation"))
     told = f"the recording was read otherwise than it looks: {said}"
     return doubt("convention", told, remedy, serious=lost > MISLEADS)
+
+
+def _causes(read: Readings) -> list[str]:
+    """What w - K (x - u) is made of that speaks against the sensor or the stiffness."""
+    found, causes = read.remains, []
+    load = np.sqrt((read.own.rows[:, 6:] ** 2).mean(0))
+    if off := _certain(found.factor - [[1.0], [0.0]], np.ones(3)):
+        shown = ", ".join(
+            f"{CHANNELS[k]} is {found.factor[0, k]:.3g} (± {found.factor[1, k]:.1g})" for k in off
+        )
+        causes.append(f"{shown} times it: another stiffness, or a gain of the sensor")
+    if drifts := _certain(found.drift, load):
+        shown = _amounts(found.drift, drifts)
+        causes.append(f"it drifts by {shown} from the first row to the last")
+    if bent := _certain(found.bend, load):
+        shown = _amounts(found.bend, bent)
+        causes.append(f"it bends by {shown} where it is largest, as of a sensor that saturates")
+    return causes
+
+
+def _friction(read: Readings) -> Account:
+    """What friction holds, as arms have it."""
+    found = read.remains.friction
+    held = [k for k in range(3) if found[0, k] > SURE * found[1, k]]
+    if not held:
+        return Account()
+    told = f"friction of the arm holds {_amounts(found, held)} against its last motion"
+    return Account((f"{told}, beside K (x - u)",))
+
+
+def _certain(values: Float[np.ndarray, "2 3"], load: Float[np.ndarray, " 3"]) -> list[int]:
+    """Channels in which a cause is there, and larger than is usual of arms and sensors."""
+    off, error = np.abs(values[0]), values[1]
+    return [
+        k for k in range(3) if off[k] > SURE * error[k] and off[k] - 2 * error[k] > LARGE * load[k]
+    ]
+
+
+def _amounts(values: Float[np.ndarray, "2 3"], chosen: list[int]) -> str:
+    return ", ".join(
+        f"{CHANNELS[k]} {values[0, k]:.2g} (± {values[1, k]:.1g}) {UNITS[k]}" for k in chosen
+    )
 
 
 def _untold(read: Readings, planar_angle: bool) -> Account:
@@ -242,6 +284,7 @@ def _used(planar: PlanarLog) -> PlanarLog:
         wrenches=planar.wrenches[kept],
         motion_left_out=planar.motion_left_out[kept],
         wrench_left_out=planar.wrench_left_out[kept],
+        command_swing=None if planar.command_swing is None else planar.command_swing[kept],
     )
 
 

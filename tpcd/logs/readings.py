@@ -32,6 +32,7 @@ from tpcd.logs.conventions import (
 )
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import Motion, Plane, WrenchReading, motion_in_plane, project
+from tpcd.logs.remains import Remains, remains
 from tpcd.logs.settled import Settled
 from tpcd.quality.lever import depth_of_contact
 
@@ -116,8 +117,8 @@ class Readings:
     """The best others, where they are much better; more than one where they fit alike."""
     alike: tuple[Reading, ...]
     """Others of one change that fit as well as the own one and make another episode."""
-    gain: Float[np.ndarray, " 3"]
-    """How many times K (x - u) each channel is, as it was read."""
+    remains: Remains
+    """What w - K (x - u) is, as it was read."""
     turned: float
     """Rotation of the settled samples since the first one, root mean square [rad]."""
 
@@ -183,7 +184,7 @@ def compare(
         and abs(r.likelihood - own.likelihood) < 1.0
         and not same_episode(r, own)
     ]
-    return Readings(own, tuple(better), tuple(alike), judge.gain(own), judge.turned)
+    return Readings(own, tuple(better), tuple(alike), judge.remains(own), judge.turned)
 
 
 def same_episode(first: Reading, second: Reading) -> bool:
@@ -253,11 +254,10 @@ class _Judge:
         rows = np.column_stack((planar.poses, planar.commands, planar.wrenches))
         found = [self._scored(changes, rest, rows, planar.motion_left_out[:, 1])]
         if len(changes) < MOST_CHANGES and not any(each.of_stiffness for each in changes):
-            factor = self._factors(rest, rows)
-            if factor is not None:
-                stiffer, cost = factor
-                made = replace(rest, stiffness=stiffer)
-                change = factor_of_stiffness(rest.stiffness, stiffer, cost)
+            fitted = self._factors(rest, rows)
+            if fitted is not None:
+                change = factor_of_stiffness(rest.stiffness, *fitted)
+                made = change.apply(rest)
                 swing = planar.motion_left_out[:, 1]
                 found.append(self._scored((*changes, change), made, rows, swing))
         return found
@@ -306,41 +306,25 @@ class _Judge:
 
     def _factors(
         self, rest: AtRest, rows: Float[np.ndarray, "k 9"]
-    ) -> tuple[Float[np.ndarray, " 3"], float] | None:
-        """The stiffness that fits the rows best and what it costs; None where it is as stated.
-
-        Least squares of w = g K (x - u) + f s for each channel, with the direction s of the last
-        motion against which friction of the arm holds: that must not pass for a factor g.
-        """
+    ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float] | None:
+        """The factors of the stiffness that fit the rows best, their standard errors, and what
+        they cost; None where it is as stated."""
         expected = _spring(rows[:, :3], rows[:, 3:6], rest.stiffness)
         scale, count = rest.scale[[0, 0, 1]], len(rows)
-        against = _directions(rows[:, :3], self.noise[:3])
-        stiffness, cost = rest.stiffness.copy(), 0.0
-        for c in range(3):
-            spring, wrench = expected[:, c], rows[:, 6 + c]
-            least = rest.stiffness[c] * self.noise[c], scale[c] * self.noise[3 + c]
-            if math.sqrt(float((spring**2).mean())) < BEYOND_NOISE * max(least):
-                continue
-            held = against[:, c] @ against[:, c]
-            beside = [
-                each - against[:, c] * (against[:, c] @ each / held if held else 0.0)
-                for each in (spring, wrench)
-            ]
-            size = float(beside[0] @ beside[0])
-            factor = float(beside[0] @ beside[1]) / size if size else 0.0
-            if not 1.0 / LARGEST < factor < LARGEST:
-                continue
-            stated, fitted = (
-                float(((beside[1] - g * beside[0]) ** 2).mean()) / scale[c] ** 2
-                + self.floor[c] ** 2
-                for g in (1.0, factor)
-            )
-            away = abs(math.log(factor))
-            error = scale[c] * math.sqrt(fitted * count / (max(count - 2, 1) * size)) / factor
+        size = np.sqrt((expected**2).mean(0))
+        felt = size > BEYOND_NOISE * np.maximum(
+            rest.stiffness * self.noise[:3], scale * self.noise[3:]
+        )
+        factor, error = remains(rows, expected, scale * self.floor).factor
+        with np.errstate(invalid="ignore", divide="ignore"):
+            away = np.abs(np.log(factor))
+            gain = 0.5 * count * np.log1p((factor - 1.0) ** 2 / error**2 / count)
             own = 0.5 * math.log(count) + 0.5 * (away / SPREAD) ** 2
-            if away > GOOD + 2.0 * error and 0.5 * count * math.log(stated / fitted) > own:
-                stiffness[c], cost = factor * stiffness[c], cost + own
-        return None if np.array_equal(stiffness, rest.stiffness) else (stiffness, COST + cost)
+            sure = (away > GOOD + 2.0 * error / factor) & (away < math.log(LARGEST))
+            other = felt & sure & (gain > own)
+        if not other.any():
+            return None
+        return np.where(other, factor, 1.0), error, COST + float(own[other].sum())
 
     def about_point(self, reading: Reading) -> list[Reading]:
         """The reading with torques about the point that fits them best; none where they fit."""
@@ -367,22 +351,10 @@ class _Judge:
         )
         return self.readings((*reading.changes, change), change.apply(rest))
 
-    def gain(self, reading: Reading) -> Float[np.ndarray, " 3"]:
-        """How many times K (x - u) each channel is; NaN where that is all zero."""
-        rows = reading.rows
-        expected = _spring(rows[:, :3], rows[:, 3:6], self.rest.stiffness)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return (rows[:, 6:] * expected).sum(0) / (expected**2).sum(0)
-
-
-def _directions(
-    poses: Float[np.ndarray, "k 3"], noise: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "k 3"]:
-    """Which way each coordinate moved last; 0 before it ever did."""
-    moved = np.diff(poses, axis=0, prepend=poses[:1])
-    far = np.abs(moved) > BEYOND_NOISE * math.sqrt(2.0) * noise
-    last = np.maximum.accumulate(np.where(far, np.arange(len(poses))[:, None], 0))
-    return np.sign(np.take_along_axis(np.where(far, moved, 0.0), last, axis=0))
+    def remains(self, reading: Reading) -> Remains:
+        """What w - K (x - u) is, by cause."""
+        expected = _spring(reading.rows[:, :3], reading.rows[:, 3:6], reading.stiffness)
+        return remains(reading.rows, expected, self.floor)
 
 
 def _much_better(best: Reading, own: Reading) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 from tpcd.logs.joining import join
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.recorded import Recorded, common_clock, places
+from tpcd.quality.sentinels import without_sentinels
 from tpcd.quality.stream import Stream
 
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
@@ -165,8 +166,11 @@ def _joined(path: Path, read: dict[str, Recorded], delays: Mapping[str, float] |
                 "record both in one frame",
             )
     times, stamps, findings = common_clock(list(read.values()))
-    streams = [
-        Stream(topic.name, CHANNELS[role], own, topic.values, stamped)
-        for (role, topic), own, stamped in zip(read.items(), times, stamps, strict=True)
-    ]
+    streams = []
+    for (role, topic), own, stamped in zip(read.items(), times, stamps, strict=True):
+        columns = dict(zip(CHANNELS[role], topic.values.T, strict=True))
+        columns, told = without_sentinels(columns, f"{topic.name}: ")
+        values = np.stack(list(columns.values()), axis=1)
+        streams.append(Stream(topic.name, CHANNELS[role], own, values, stamped))
+        notes += told
     return join(path, streams, delays=delays, findings=findings, notes=notes)

@@ -31,6 +31,7 @@ from tpcd.logs.joining import join
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.table import Columns, Table, place, text_among_numbers, units_of
 from tpcd.quality.clocks import JUMP
+from tpcd.quality.sentinels import without_sentinels
 from tpcd.quality.stream import Stream
 from tpcd.quality.suggest import suggest_map
 
@@ -160,7 +161,8 @@ def log_from_columns(
 def read_numbers(
     columns: Columns, mapped: Mapping[str, tuple[str, str]], path: Path
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The mapped columns in SI units, and which units were taken from where; times since the first.
+    """The mapped columns in SI units, and which units were taken from where; times since the first,
+    and NaN for numbers that stand for no reading, which is told.
 
     Raises `LogError` for a column that holds text, with the line and what stands there.
     """
@@ -184,6 +186,10 @@ def read_numbers(
             content = content.astype(np.int64) if content.dtype.kind == "u" else content
         factor = UNITS[name][unit or next(iter(UNITS[name]))]
         content = content.astype(np.float64, copy=False)
+        if name != "time":
+            # A sentinel is one in the unit that it was written in.
+            read, told = without_sentinels({name: content})
+            content, notes = read[name], notes + told
         values[name] = content if factor == 1.0 else factor * content
     return values, notes
 

@@ -118,12 +118,12 @@ def _missing(stream: Stream) -> Iterator[Finding]:
         first, last = stream.times[rows[[0, -1]]]
         told = (
             f"{len(rows)} of {len(stream.times)} samples lack a number ({', '.join(names)}; rows"
-            f" {_listed(rows)}; from {first:.4g} to {last:.4g} s) and are not used"
+            f" {listed_rows(rows)}; from {first:.4g} to {last:.4g} s) and are not used"
         )
         yield Finding("missing", Weight.NOTE, told, names)
 
 
-def _listed(rows: Int[np.ndarray, " k"]) -> str:
+def listed_rows(rows: Int[np.ndarray, " k"]) -> str:
     """Rows as ranges, the first few of them."""
     cuts = np.flatnonzero(np.diff(rows) > 1)
     parts = [

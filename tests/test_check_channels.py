@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_streams import TURNED, WRENCH, alarms, changed, frozen, made_stream
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from tpcd.quality.channels import check_channels
 from tpcd.quality.finding import Finding, Weight, usable
@@ -131,6 +132,52 @@ def test_a_channel_at_the_end_of_its_range_is_clipped(side: float, part: float) 
             assert each.weight is Weight.LEFT_OUT and each.rows is not None
             covered[slice(*each.rows)] = True
         assert covered[cut].all() and covered.sum() < 1.5 * len(cut) + 100
+
+
+@pytest.mark.parametrize(
+    ("side", "part", "scatter"),
+    [(1.0, 0.95, 0.02), (-1.0, 0.6, 0.02), (-1.0, 0.8, 0.01), (-1.0, 0.95, 0.02)],
+)
+def test_a_limit_with_noise_on_top_is_clipped(side: float, part: float, scatter: float) -> None:
+    stream = made_stream()
+    column = stream.channels.index("F_x")
+    limit = float(np.quantile(side * stream.values[:, column], part))
+    values = stream.values.copy()
+    values[:, column] = side * np.minimum(side * values[:, column], limit)
+    at_end = values[:, column] == side * limit
+    values[:, column] += scatter * np.random.default_rng(2).normal(size=len(values))
+    told = found(replace(stream, values=values), "clipped", "F_x")
+    covered = np.zeros(len(values), dtype=bool)
+    for each in told:
+        assert each.weight is Weight.LEFT_OUT and each.rows is not None
+        covered[slice(*each.rows)] = True
+    assert covered[at_end].mean() > 0.9 and covered.sum() < 3 * at_end.sum() + 100
+
+
+def test_quiet_free_air_between_presses_that_chatter_is_no_limit() -> None:
+    random = np.random.default_rng(4)
+    times = np.arange(6000) / 100.0
+    pressed = (times % 10.0 > 4.0)[:, None] * (3.0 + random.normal(0.0, 0.4, (6000, 3)))
+    values = pressed + random.normal(0.0, 0.02, (6000, 3))
+    stream = Stream("made", ("F_x", "F_y", "F_z"), times, values)
+    assert alarms(check_channels([stream])) == []
+
+
+@pytest.mark.parametrize("digits", [3, 9])
+def test_a_wrench_that_froze_in_the_sensor_and_turned_with_the_hand_is_frozen(digits: int) -> None:
+    stream = made_stream()
+    turns = Rotation.from_quat(stream.values[:, 3:7])
+    values = stream.values.copy()
+    values[2000:2300, 7:13] = values[2000, 7:13]
+    for part in (slice(7, 10), slice(10, 13)):
+        values[:, part] = turns.apply(values[:, part]).round(digits)
+    told = alarms(check_channels([replace(stream, values=values)]))
+    assert {name for each in told for name in each.channels} == set(WRENCH) - {"tau"}
+    assert any("turned with the hand" in each.sentence for each in told)
+    out = ~usable(stream.times, told)
+    assert out[2000:2300].all() and out.sum() < 305
+    values[2000:2300, 7:13] = stream.values[2000:2300, 7:13]
+    assert alarms(check_channels([replace(stream, values=values)])) == []
 
 
 def test_a_spike_is_one_sample_and_a_step_is_none() -> None:

@@ -15,7 +15,12 @@ from tpcd.quality.finding import Finding, Weight
 from tpcd.quality.habit import COARSEST, Habit, find_habit, grid_step
 from tpcd.quality.spikes import find_spikes
 from tpcd.quality.stream import Stream
-from tpcd.quality.stretches import Stretch, clipped_stretches, frozen_stretches
+from tpcd.quality.stretches import (
+    Stretch,
+    clipped_stretches,
+    frozen_stretches,
+    squeezed_stretches,
+)
 
 FORCES = ("F_x", "F_y", "F_z")
 TORQUES = ("T_x", "T_y", "T_z", "tau")
@@ -33,6 +38,12 @@ UNITS = {
 MIXED = np.sqrt([1.0, 2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0])
 """A sum with these weights changes where any of its parts does."""
 MOST_LISTED = 6
+ROUNDED = 1e-7
+"""Lengths of vectors that are turned differ by this part in single precision."""
+ALL_BUT = 0.9
+"""Part of the steps of a length that are none, in a stretch in which it stays."""
+FINE = 0.2
+"""Steps of a length that are larger beside its noise tell nothing."""
 TOGETHER = 2
 """Channels whose stretches begin and end within so many samples share one cause."""
 
@@ -85,6 +96,7 @@ def check_channels(streams: Sequence[Stream]) -> tuple[Finding, ...]:
             for channel in channels:
                 found += _manner(channel)
                 stretches += _stretches(channel, group)
+            stretches += _turned(stream, stretches) if group == WRENCH else []
             found += _told(stretches)
     return tuple(found)
 
@@ -99,6 +111,7 @@ def _stretches(channel: Channel, group: Sequence[str]) -> Iterator[tuple[str, Ch
     clipped = ()
     if group == WRENCH:
         clipped = clipped_stretches(channel.values, channel.habit)
+        clipped = clipped or squeezed_stretches(channel.values, channel.habit)
     yield from (("clipped", channel, each) for each in clipped)
     told = {each.value for each in clipped}
     ends = {float(channel.values.min()), float(channel.values.max())} if group == WRENCH else set()
@@ -107,6 +120,44 @@ def _stretches(channel: Channel, group: Sequence[str]) -> Iterator[tuple[str, Ch
             yield "clipped" if each.value in ends else "frozen", channel, each
     for place in find_spikes(channel.values, channel.habit.step):
         yield "spike", channel, Stretch(int(place), int(place) + 1, float(channel.values[place]))
+
+
+def _turned(
+    stream: Stream, known: Sequence[tuple[str, Channel, Stretch]]
+) -> list[tuple[str, Channel, Stretch]]:
+    """Stretches in which a force or a torque keeps its length, to the digits it is written in, and
+    none of its entries alone: the sensor was frozen, and its readings turned with the hand."""
+    found = []
+    for names in (FORCES, TORQUES):
+        present = [k for k, name in enumerate(stream.channels) if name in names]
+        samples = np.flatnonzero(np.isfinite(stream.values[:, present]).all(1))
+        if len(present) < 2 or not len(samples):
+            continue
+        parts = stream.values[np.ix_(samples, present)]
+        lengths = np.linalg.norm(parts, axis=1)
+        digits = float(np.linalg.norm([grid_step(column) for column in parts.T]))
+        least = max(2.0 * digits, ROUNDED * float(lengths.max()))
+        again = np.abs(np.diff(lengths, prepend=np.inf)) <= least
+        kept = lengths[np.maximum.accumulate(np.where(again, 0, np.arange(len(samples))))]
+        habit = find_habit(kept, least)
+        if not habit.lively or least > FINE * habit.noise:
+            continue
+        channel = Channel(
+            ", ".join(stream.channels[k] for k in present), stream, samples, kept, habit
+        )
+        for each in frozen_stretches(kept, habit, np.empty((len(kept), 0))):
+            alone = {
+                other.name
+                for _, other, one in known
+                if 2 * (min(one.end, each.end) - max(one.first, each.first)) > each.end - each.first
+            }
+            rest = [k for k, c in enumerate(present) if stream.channels[c] not in alone]
+            moving = parts[each.first : each.end, rest]
+            left = np.abs(np.diff(np.linalg.norm(moving, axis=1)))
+            # Where one entry froze that is nearly all of the length, the others go on.
+            if np.ptp(moving, axis=0).any() and np.quantile(left, ALL_BUT) <= least:
+                found.append(("frozen", channel, each))
+    return found
 
 
 def _missing(stream: Stream) -> Iterator[Finding]:
@@ -171,7 +222,9 @@ def _finding(kind: str, channel: Channel, names: list[str], stretch: Stretch) ->
     times, count = channel.times, stretch.end - stretch.first
     start, end = float(times[stretch.first]), float(times[stretch.end - 1])
     rows = int(channel.samples[stretch.first]), int(channel.samples[stretch.end - 1]) + 1
-    who, alone = ", ".join(names), len(names) == 1 and names[0] != "rotation"
+    turned = any(", " in name for name in names)
+    parts = tuple(dict.fromkeys(part for name in names for part in name.split(", ")))
+    who, alone = ", ".join(parts), len(parts) == 1 and names[0] != "rotation"
     during = f"from {start:.4g} to {end:.4g} s ({count} samples, rows {rows[0]} to {rows[1] - 1})"
     remedy = "look at the sensor's connection and driver"
     if kind == "spike":
@@ -188,8 +241,11 @@ def _finding(kind: str, channel: Channel, names: list[str], stretch: Stretch) ->
         remedy = "press less, or use a sensor with a larger range"
     else:
         told = f"{who}: frozen {f'at {stretch.value:.6g} ' if alone else ''}{during}"
+        if turned:
+            told = f"{who}: frozen in the sensor and turned with the hand {during}: their length"
+            told += f" stays {stretch.value:.6g}"
         if channel.habit.lively:
             told += f", expected at most {channel.habit.longest:.0f} samples with one value"
         else:
             told += ", then it jumps, while others moved"
-    return Finding(kind, Weight.LEFT_OUT, told, tuple(names), start, end, rows, remedy)
+    return Finding(kind, Weight.LEFT_OUT, told, parts, start, end, rows, remedy)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import uniform_filter1d
 
-from tpcd.quality.habit import Habit
+from tpcd.quality.habit import Habit, find_habit
 
 BRIDGED = 20
 """Clipped samples this few updates apart are one stretch: what is between is cut off in part."""
@@ -21,6 +22,18 @@ FINEST = 1.5
 JUMP = 5.0
 """A channel without noise is frozen where it comes back with a jump of this many times its largest
 change elsewhere."""
+OFTEN = 0.75
+"""Part of the moments in which readings scatter by less than what is usual,"""
+SQUEEZED = 5.0
+"""and behind a limit they scatter so many times less than that,"""
+AROUND = 8
+"""over so many updates,"""
+AGAIN = 2
+"""and do so at one level in so many stretches,"""
+WITHIN = 4.5
+"""which they keep to within so many standard deviations,"""
+RARE = 0.1
+"""while hardly any others do: this part of them."""
 FEWEST_MOVES = 20
 """Changes of its neighbours meanwhile that such a verdict needs."""
 
@@ -68,6 +81,40 @@ def clipped_stretches(values: Float[np.ndarray, " n"], habit: Habit) -> tuple[St
         enough = count >= FEWEST_CLIPPED * habit.hold and count > 1.5 * beside
         if enough and count > beside + 5.0 * np.sqrt(habit.hold * (beside + 1.0)):
             found += _bridged(at_end, BRIDGED * habit.hold, sign * top)
+    return tuple(sorted(found, key=lambda each: each.first))
+
+
+def squeezed_stretches(values: Float[np.ndarray, " n"], habit: Habit) -> tuple[Stretch, ...]:
+    """Where a channel is at the end of its range before its last noise, as of digits, is added:
+    readings scatter much less than elsewhere, several times at one level, and none lies beyond it.
+
+    Free air may be so quiet and at an end too; a recording begins in it.
+    """
+    updates = values[:: habit.hold]
+    if len(updates) < 4 * AROUND:
+        return ()
+    bend = np.diff(updates, 2, prepend=updates[:1], append=updates[-1:])
+    # A second difference of white noise has six times its variance.
+    local = np.sqrt(np.maximum(uniform_filter1d(bend**2, AROUND, mode="nearest"), 0.0) / 6.0)
+    usual = float(np.quantile(local, OFTEN))
+    quiet = (local < usual / SQUEEZED) & (local > 0.0)
+    found: list[Stretch] = []
+    for sign in (1.0, -1.0):
+        top = float((sign * updates).max())
+        near = quiet & (sign * updates > top - usual)
+        if near.sum() < AGAIN * AROUND or (quiet & ~near).sum() > RARE * near.sum():
+            continue
+        scatter = max(float(np.median(local[near])), habit.step / np.sqrt(12.0))
+        level = float(np.median(sign * updates[near]))
+        band = np.abs(sign * values - level) <= WITHIN * scatter
+        begun = band[: AROUND * habit.hold].any()
+        if begun or band.all() or top > level + WITHIN * scatter:
+            continue
+        if find_habit(values[~band]).lively:
+            stretches = _bridged(band, BRIDGED * habit.hold, sign * level)
+            least = AROUND * habit.hold
+            long = [each for each in stretches if band[each.first : each.end].sum() >= least]
+            found += long if len(long) >= AGAIN else []
     return tuple(sorted(found, key=lambda each: each.first))
 
 

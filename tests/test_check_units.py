@@ -65,6 +65,15 @@ def test_angles_in_degrees_and_times_in_milliseconds_are_named() -> None:
     assert told.channels == ("time",) and "milliseconds" in told.sentence
 
 
+def test_turns_that_are_counted_on_are_not_plainly_degrees() -> None:
+    times = np.arange(6000) / 100.0
+    turned = Stream("made", ("phi",), times, 0.8 * times[:, None])
+    (told,) = check_units([turned])
+    assert told.weight is Weight.DOUBT and "or turns that are counted on" in told.sentence
+    (told,) = check_units([replace(turned, values=180 / np.pi * turned.values)])
+    assert told.weight is Weight.SERIOUS and told.sentence.endswith("looks like degrees")
+
+
 def test_metres_taken_for_millimetres_are_doubted() -> None:
     stream = scaled(made_stream(), ("x", "y", "z"), 1e-3)
     told = check_units([stream])

@@ -18,7 +18,7 @@ from tpcd.logs.columns import log_from_columns
 from tpcd.logs.conventions import RotationReading
 from tpcd.logs.importing import Importing, import_log
 from tpcd.logs.log import Log, LogError, RotationNumbers
-from tpcd.logs.plane import WrenchReading
+from tpcd.logs.plane import Plane, WrenchReading
 from tpcd.quality.finding import Finding, Weight
 
 EPISODE = an_episode(20)
@@ -331,6 +331,36 @@ def test_axes_of_euler_angles_are_named(axes: str) -> None:
     choices = replace(choices, plane=replace(choices.plane, tool_x=None))
     (doubt,) = convention_doubts(log, choices)
     assert f"--euler {axes}" in doubt.remedy
+
+
+@pytest.mark.parametrize("which", ["both", "pose"])
+def test_angles_that_count_their_turns_are_the_same_episode(which: str) -> None:
+    turns = 8.0 * np.pi * np.linspace(0.0, 1.0, len(EPISODE))
+    values = [EPISODE.poses.clone(), EPISODE.commands.clone()]
+    for each in values:
+        each[:, 2] += torch.from_numpy(turns)
+    samples = sampled(replace(EPISODE, poses=values[0], commands=values[1], unusual=True))
+    columns = {"time": samples["time"]}
+    for names, key in (("u_x u_z u_phi", "u"), ("x z phi", "pose"), ("F_x F_z tau", "wrench")):
+        columns |= {name: samples[key][:, k] for k, name in enumerate(names.split())}
+    if which == "pose":
+        columns["u_phi"] = np.angle(np.exp(1j * columns["u_phi"]))
+    log = log_from_columns(columns, [f"{name}={name}" for name in columns], Path("planar.csv"))
+    assert columns["phi"].max() > 25.0
+    found = import_log(log, Importing(STIFFNESS))
+    assert found.account.doubts == () and isinstance(found.content, Episode)
+    assert float(found.content.poses[:, 2].abs().max()) <= np.pi
+
+
+def test_a_hand_that_turns_over_out_of_the_plane_is_told_so() -> None:
+    log = log_of(ALONG, SAMPLES)
+    assert log.command_rotations is not None
+    over = Rotation.from_rotvec(np.outer(np.linspace(0.0, np.pi, len(log)), [1.0, 0.0, 0.0]))
+    log = replace(
+        log, rotations=over * log.rotations, command_rotations=over * log.command_rotations
+    )
+    with pytest.raises(LogError, match="turned out of the plane by 1[78]. degrees .*--plane_x"):
+        import_log(log, replace(choices_of(ALONG), plane=Plane()))
 
 
 def test_what_free_motion_and_small_turns_cannot_show_is_said() -> None:

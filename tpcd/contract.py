@@ -20,6 +20,8 @@ LARGEST_LENGTH = 5.0
 """Lengths beyond this [m] are taken for millimetres: no arm reaches so far."""
 LARGEST_ANGLE = 2 * math.pi
 """Angles beyond this [rad] are taken for degrees."""
+COUNTED = "degrees, or turns that are counted on (wrap them to within pi)"
+"""What larger angles look like."""
 LEAST_STIFFNESS, LARGEST_STIFFNESS = 10.0, 1e6
 """Springs of an arm [N/m]. Softer ones are taken for N/mm, in which arms have 0.03 to 5; no arm is
 stiffer."""
@@ -87,7 +89,7 @@ def check_pose(name: str, value: Float[Tensor, "*batch 3"], unusual: bool = Fals
         largest = value.abs().reshape(-1, 3).nan_to_num(0.0, 0.0, 0.0).amax(0).tolist()
     for reached, limit, unit, likely in (
         (max(largest[:2]), LARGEST_LENGTH, "m", "millimetres"),
-        (largest[2], LARGEST_ANGLE, "rad", "degrees"),
+        (largest[2], LARGEST_ANGLE, "rad", COUNTED),
     ):
         if reached > limit:
             raise ValueError(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tpcd.contract import LARGEST_ANGLE, LARGEST_LENGTH
+from tpcd.contract import COUNTED, LARGEST_ANGLE, LARGEST_LENGTH
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 
@@ -35,7 +35,7 @@ def check_columns(
     """Refuse what is not finite, or no number in SI units, lengths and angles only where they are
     not said to be `unusual`; raises `EpisodeError` naming the row."""
     length = (math.inf if unusual else LARGEST_LENGTH, "m", "millimetres")
-    angle = (math.inf if unusual else LARGEST_ANGLE, "rad", "degrees")
+    angle = (math.inf if unusual else LARGEST_ANGLE, "rad", COUNTED)
     force, torque = (LARGEST_WRENCH, "N", "millinewtons"), (LARGEST_WRENCH, "N·m", "mN·m")
     columns = (
         (COMMAND_COLUMNS, commands, (length, length, angle)),

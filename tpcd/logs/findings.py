@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.logs.log import Log
+from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog
 from tpcd.logs.readings import (
     BEYOND_NOISE,
@@ -30,6 +31,9 @@ OUT_OF_PLANE_MOTION = 0.1
 """Motion out of the plane beyond this part of that within it is doubtful."""
 OUT_OF_PLANE_FORCE = 0.2
 """The same of forces."""
+OUT_OF_PLANE_TURN, LOST = 0.5, 2.5
+"""Rotation out of the plane beyond this [rad] is doubtful; near half a turn there is no angle in
+the plane."""
 MISLEADS = 0.2
 """A reading that leaves so much more than another makes an episode that misleads."""
 SWING_TOLD = 0.1
@@ -95,6 +99,29 @@ def left_out(planar: PlanarLog) -> Account:
     return Account((finding,), tuple(doubts))
 
 
+def turned_out(path: Path, planar: PlanarLog) -> Account:
+    """Whether much of the rotation is out of the plane; raises `LogError` where it has no angle in
+    the plane any more."""
+    planar, doubts = _used(planar), ()
+    parts = [("end effector", planar.motion_left_out[:, 1])]
+    if planar.command_swing is not None:
+        parts.append(("set point", planar.command_swing))
+    for what, swing in parts:
+        k = int(np.argmax(swing))
+        if swing[k] > LOST:
+            raise LogError(
+                path,
+                f"the {what} is turned out of the plane by {math.degrees(swing[k]):.0f} degrees at"
+                f" {planar.times[k]:.4g} s, where it has no angle in the plane",
+                "choose the plane about whose normal it turns (--plane_x, --plane_z), or the part"
+                " that does with --start and --end",
+            )
+        if swing[k] > OUT_OF_PLANE_TURN:
+            told = f"much of the rotation of the {what} is out of the plane"
+            doubts = (doubt("plane", told, "check --plane_x and --plane_z"),)
+    return Account((), doubts)
+
+
 def account_of(read: Readings | None, log: Log) -> Account:
     """What the test of the conventions says: what is left of K (x - u), and what fits better."""
     if read is None:
@@ -116,7 +143,7 @@ def account_of(read: Readings | None, log: Log) -> Account:
             )
             remedy = "map it: u_qx u_qy u_qz u_qw, u_rx u_ry u_rz, u_e1 u_e2 u_e3 or u_phi"
             return account + Account((), (doubt("convention", told, remedy, serious=True),))
-        causes = _causes(read)
+        causes = [each for each in _causes(read) if "bends" in each]
         told = (
             "no order, sense, sign, frame or unit of rotations and wrench fits K (x - u):"
             f" it leaves {_left(own)} over {rows} rows" + "".join(f"; {each}" for each in causes)

@@ -30,8 +30,10 @@ from tpcd.logs.findings import (
     doubt,
     left_out,
     spring_wrench,
+    turned_out,
     zeroed_in_contact,
 )
+from tpcd.logs.joining import ROTATIONS
 from tpcd.logs.log import AXES, Log, LogError
 from tpcd.logs.plane import PlanarLog, Plane, WrenchReading, project
 from tpcd.logs.readings import Readings, compare
@@ -40,7 +42,11 @@ from tpcd.logs.units import doubted_units
 from tpcd.quality.finding import Finding, Weight
 
 NO_SET_POINTS = "no set points in the map: steps cannot be told apart, and nothing can be learnt"
-PROVEN = {prefix + axis for prefix in ("", "u_", "F_") for axis in AXES}
+ANGLES = [name for kind, names in ROTATIONS.items() if kind != "quaternion" for name in names]
+PROVEN = {
+    "force": [prefix + axis for prefix in ("", "u_", "F_") for axis in AXES],
+    "torque": [prefix + name for prefix in ("", "u_") for name in ANGLES],
+}
 FREE_FORCE = 1.0
 """A start that is pressed harder than this by K (x - u) is not free [N]."""
 
@@ -102,12 +108,17 @@ def import_log(log: Log, choices: Importing) -> Imported:
         raise _likelier(error, (*_better(_unsettled(log, choices), log), *units)) from error
     read = _compared(log, settled, choices)
     stiffness = np.array(choices.stiffness)
-    if read is not None and "force" in read.own.left and read.own.fits:
-        # Forces that are K (x - u) are proof of their units and of those of positions.
-        units = tuple(e for e in units if not (e.channels and set(e.channels) <= PROVEN))
+    if read is not None and read.own.fits:
+        # Forces that are K (x - u) are proof of their units and of those of positions, and so are
+        # torques of angles.
+        proven = {name for kind in read.own.left for name in PROVEN.get(kind, ())}
+        units = tuple(e for e in units if not (e.channels and set(e.channels) <= proven))
     conventions = account_of(read, log)
     account = _told(log) + Account(_counted(log, planar, settled), units)
-    account += left_out(planar) + conventions
+    account += left_out(planar)
+    if read is None or not read.in_plane_otherwise:
+        account += turned_out(log.path, planar)
+    account += conventions
     restless = _restless(settled, choices.stillness)
     std = choices.sensor_std
     if std is None and not restless:

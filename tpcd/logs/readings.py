@@ -122,6 +122,11 @@ class Readings:
     turned: float
     """Rotation of the settled samples since the first one, root mean square [rad]."""
 
+    @property
+    def in_plane_otherwise(self) -> bool:
+        """Whether what fits better has the rotation in the plane."""
+        return any(each.left.get("rotation", 0.0) <= MISSED for each in self.better[:1])
+
 
 def at_rest(log: Log, settled: Settled) -> Log:
     """One sample for each settled stretch: means, and the rotation nearest to the mean one."""

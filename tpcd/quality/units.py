@@ -23,6 +23,8 @@ TINY = 2e-3
 """An arm whose positions all stay below this in size [m] was read in too large a unit."""
 TURN, PLAINLY_TURNED = 2 * np.pi + 0.1, 30.0
 """The same of angles [rad]."""
+QUICK, OVER = 4.0, 0.2
+"""Joints of arms turn no faster [rad/s], over so long [s]."""
 FASTEST = 30.0
 """No arm turns faster [rad/s]."""
 STRONG, PLAINLY_STRONG = 2e3, 2e4
@@ -94,16 +96,35 @@ def _too_large(stream: Stream, unit: Unit) -> Iterator[Finding]:
         return
     name = max(sizes, key=lambda each: sizes[each])
     size = sizes[name]
-    serious = size > unit.plain
     names = tuple(each for each in unit.names if each in sizes)
+    # Turns that are counted on go far, and no faster than an arm turns.
+    counted = unit.symbol == "rad" and _speed(stream, names) < QUICK
+    serious = size > unit.plain and not counted
+    told = f"{'looks like' if serious else 'perhaps'} {unit.likely}"
+    told += ", or turns that are counted on" if counted else ""
     yield Finding(
         "unit",
         Weight.SERIOUS if serious else Weight.DOUBT,
         f"{name} reaches {size:.4g} {unit.symbol}, expected at most {unit.doubtful:.2g} of an arm:"
-        f" {'looks like' if serious else 'perhaps'} {unit.likely}",
+        f" {told}",
         names,
         remedy=f"map {', '.join(names)} with their unit: {name}=COLUMN:{unit.entry}",
     )
+
+
+def _speed(stream: Stream, names: Sequence[str]) -> float:
+    """How fast the fastest of some channels changes in all but two of a hundred samples, over
+    `OVER` seconds; infinite where samples are further apart."""
+    spacing = float(np.median(np.diff(stream.times))) if len(stream.times) > 1 else np.inf
+    lag = max(1, round(OVER / spacing)) if 0 < spacing <= OVER else 0
+    if not lag or len(stream.times) < 2 * lag:
+        return np.inf
+    columns = stream.values[:, [stream.channels.index(name) for name in names]]
+    speeds = (
+        np.abs(columns[lag:] - columns[:-lag]) / (stream.times[lag:] - stream.times[:-lag])[:, None]
+    )
+    speeds = speeds[np.isfinite(speeds)]
+    return float(np.quantile(speeds, 0.98)) if len(speeds) else np.inf
 
 
 def _too_small(stream: Stream) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ import torch
 from robot_bench import wired_arm
 
 from tpcd.errors import RobotError
+from tpcd.robot.preflight import FreeAir, longest_repeat
 
 NAN = float("nan")
 
@@ -77,3 +78,18 @@ def test_a_command_that_is_no_number_is_refused_before_anything_moves(
     with pytest.raises(RobotError, match="outside of the workspace"):
         arm.settle(start)
     assert sent == [] and arm.at_rest is None
+
+
+def air(noise: float, step: float = 0.0, every: int = 1) -> FreeAir:
+    """Readings of a still arm, in steps, of a sensor that is read more often than it reads."""
+    read = np.random.default_rng(0).normal(0.0, noise, (1000 // every, 3)) * [1.0, 1.0, 0.05]
+    read = np.repeat(np.round(read / step) * step if step else read, every, axis=0)
+    return FreeAir(np.arange(len(read)) / 500.0, 0.0 * read, read)
+
+
+@pytest.mark.parametrize("noise", [4e-4, 0.05, 1.0])
+def test_how_long_a_wrench_may_repeat_follows_from_the_sensor_whatever_its_noise(noise) -> None:
+    assert longest_repeat(air(noise)) == 10
+    assert longest_repeat(air(noise, noise / 2)) < 60
+    assert 40 <= longest_repeat(air(noise, every=4)) < 100
+    assert longest_repeat(air(0.0)) == np.inf

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from tpcd.errors import RobotError
+from tpcd.quality.habit import find_habit
 from tpcd.robot.settling import SettlingSettings
 
 LARGEST_BEFORE_ZEROING = 10.0
@@ -148,6 +149,13 @@ def check_tilted(left: FreeAir, right: FreeAir) -> float:
 def reading_noise(air: FreeAir) -> Float[np.ndarray, " 3"]:
     """Standard deviation of one reading of the wrench [N, N, N·m]."""
     return np.diff(air.wrenches, axis=0).std(0) / np.sqrt(2)
+
+
+def longest_repeat(air: FreeAir) -> float:
+    """For how many readings a working sensor repeats a wrench; infinite where it has no noise."""
+    # A sum with these weights changes where any of its parts does.
+    habit = find_habit(air.wrenches @ np.sqrt([1.0, 2.0, 3.0]), 0.0)
+    return habit.longest if habit.lively else np.inf
 
 
 def mean_noise(

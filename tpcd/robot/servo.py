@@ -56,9 +56,8 @@ GENTLE = 2.5
 PROGRESS = 0.01
 """Share of the command's way whose time is limited, while the arm follows."""
 FROZEN = 0.1
-"""A wrench that repeats exactly for so long is of a sensor that has stopped [s]."""
-NOISY = 1e-3
-"""Whose readings have at least this noise [N]; one without may rest."""
+"""A wrench that repeats exactly for so long [s], and for longer than its own habit in free air
+allows, is of a sensor that has stopped."""
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -87,6 +86,8 @@ class Servo:
         """Where the arm is sent; None while it is only read."""
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
+        self.longest_repeat = np.inf
+        """Readings of a working sensor that may repeat one wrench."""
         self._over, self._slower, self._repeated = 0, 0, 0
         self._last_wrench: np.ndarray | None = None
         self._retreating: int | None = None
@@ -135,7 +136,7 @@ class Servo:
         same = self._last_wrench is not None and np.array_equal(sample.wrench, self._last_wrench)
         self._repeated = self._repeated + 1 if same else 0
         self._last_wrench = np.array(sample.wrench)
-        frozen = self._repeated > FROZEN * self.link.rate and float(self.noise[:2].min()) > NOISY
+        frozen = self._repeated > max(FROZEN * self.link.rate, self.longest_repeat)
         if frozen and not self._retreating:
             raise RobotError(
                 f"the force sensor repeats {self._last_wrench[:3].tolist()} N exactly, where single"

@@ -72,6 +72,7 @@ def lift(servo: Servo) -> Lifted:
     air = servo.stand(servo.settings.still_time)
     preflight.check_drift(air)
     servo.noise = preflight.reading_noise(air)
+    servo.longest_repeat = preflight.longest_repeat(air)
     return Lifted(start, preflight.touch(here, air))
 
 

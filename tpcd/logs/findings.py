@@ -13,17 +13,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from tpcd.logs.hypotheses import BEYOND_NOISE, LEAST_TURN, MISSED, WITHIN, Reading
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog
-from tpcd.logs.readings import (
-    BEYOND_NOISE,
-    LEAST_TURN,
-    MISSED,
-    WITHIN,
-    Reading,
-    Readings,
-    same_episode,
-)
+from tpcd.logs.readings import Readings, same_episode
 from tpcd.logs.settled import Settled
 from tpcd.quality.finding import Finding, Weight, usable
 

@@ -58,7 +58,8 @@ def emulate(config: Emulation) -> None:
         write_text(config.truth, to_yaml(content, flow=True))
     print(
         f"{scene.outline_name} over a floor that yields {config.surface_mm_per_10n:g} mm at"
-        f" 10 N, on {config.address}, fault {config.fault}; Ctrl-C ends it",
+        f" 10 N, on {config.address}, fault {config.fault}; Ctrl-C ends it"
+        + ("" if config.force_noise else "; without noise it is for robot.py --noise_free"),
         file=sys.stderr,
         flush=True,
     )

@@ -71,6 +71,9 @@ class Experiment(ExploringOptions):
     settle_time: float = 60.0
     """Longest time to wait for a steady pose and force once the command has arrived, or for it to
     get on, on top of the way at full speed [s]."""
+    noise_free: bool = False
+    """The force sensor has no noise, as an emulator's with --force_noise 0; of any other, readings
+    that repeat exactly end the run."""
     yes: bool = False
     """Workspace and limits are confirmed beforehand; nobody is asked."""
 
@@ -101,7 +104,7 @@ class Experiment(ExploringOptions):
 
 MAY_CHANGE = (
     "robot", "yes", "settle_time", "stale_time", "surface_mm_per_10n", "stop_force", "payload",
-    "rate",
+    "rate", "noise_free",
 )  # fmt: skip
 """Options, beside those of every exploration, with which a stopped run may go on."""
 
@@ -163,6 +166,7 @@ def _settings(config: Experiment) -> ArmSettings:
         config.rate,
         config.stale_time,
         config.settle_time,
+        noise_free=config.noise_free,
         priors={name: (value[0], value[1]) for name, value in given.items() if value},
         notes=f"explored with the arm at {config.robot}, policy {config.policy}",
     )

@@ -7,6 +7,7 @@ jaxtyping with beartype; this must be set before anything imports tpcd.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,3 +90,12 @@ def tolerance(dtype: torch.dtype) -> dict[str, float]:
 def tolerances() -> dict[torch.dtype, Tolerance]:
     """The whole table dtype -> tolerances, for tests that use several dtypes."""
     return TOLERANCES
+
+
+@pytest.fixture
+def types_unchecked() -> Iterator[None]:
+    """Shapes and types are not checked meanwhile: for loops whose thousands of turns a test waits
+    for, and whose types others check."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

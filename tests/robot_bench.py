@@ -6,8 +6,10 @@ import itertools
 import json
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,9 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import torch
+from command_calls import PRIOR, load_script
 
+from tpcd.belief.settings import EstimatorSettings, SamplerSettings
 from tpcd.errors import RobotError
 from tpcd.robot.admittance import AdmittanceSettings, at_rest
 from tpcd.robot.arm_settings import ArmSettings
@@ -30,6 +34,7 @@ from tpcd.robot.settling import SettlingSettings
 from tpcd.robot.ur import UniversalRobot
 
 _COUNT = itertools.count(1)
+FEW = SamplerSettings(particles=60, draws=200, places=10, fresh_modes=4, prior_draws=100)
 SURFACE = 5.0
 """Yield of floor and wall [mm per 10 N]: soft, so that the arm settles soon."""
 STATED_TIME = 2.0
@@ -72,6 +77,7 @@ def arm_on(emulator: EmulatorSettings, folder: Path, **changed: Any) -> Universa
     settings: dict[str, Any] = {
         "address": emulator.address, "origin": emulator.origin, "still_time": 1.5,
         "stale_time": 1.0, "surface_mm_per_10n": SURFACE, "payload": emulator.payload,
+        "noise_free": emulator.force_noise == 0.0,
     }  # fmt: skip
     return UniversalRobot(ArmSettings(**{**settings, **changed}), folder, lambda _: True)
 
@@ -132,8 +138,9 @@ class Springy(Link):
     """An arm that is where it was told to be over a floor that is a spring, quick enough to fail in
     every way that there is. The tool points down, at angle zero."""
 
-    def __init__(self, pose: tuple[float, float, float]) -> None:
-        self.alive, self.rate, self.time = True, 125.0, 0.0
+    def __init__(self, pose: tuple[float, float, float], drift: float = 0.0) -> None:
+        """`drift` of the force [N/s]."""
+        self.alive, self.rate, self.time, self._drift = True, 125.0, 0.0, drift
         self.frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
         self.target = tcp_pose(self.frame, np.array(pose))
         self.zero, self.sent = 0.0, 0
@@ -146,8 +153,13 @@ class Springy(Link):
     def next_sample(self) -> Sample:
         """The reading after this one."""
         self.time += 1 / self.rate
-        wrench = np.array([0.0, 0.0, self.force - self.zero, 0.0, 0.0, 0.0])
+        wrench = np.array([0.0, 0.0, self.sensed - self.zero, 0.0, 0.0, 0.0])
         return Sample(self.time, self.target, wrench, self.target, 0.0)
+
+    @property
+    def sensed(self) -> float:
+        """What the sensor makes of the force before it is zeroed [N]."""
+        return self.force + self._drift * self.time
 
     def servo(self, target: np.ndarray) -> None:
         """Where the arm is to be."""
@@ -155,7 +167,7 @@ class Springy(Link):
 
     def zero_sensor(self) -> None:
         """Take the present wrench for zero."""
-        self.zero = self.force
+        self.zero = self.sensed
 
     def payload(self) -> float:
         """What it was told that it carries [kg]."""
@@ -167,6 +179,33 @@ class Springy(Link):
     def disconnect(self) -> None:
         """Nothing is open."""
         self.alive = False
+
+
+def springy_commands(
+    monkeypatch: pytest.MonkeyPatch, links: Sequence[Springy], folder: Path
+) -> Callable[..., int]:
+    """Calls scripts/robot.py, each time on the next of these links, with few draws, into
+    `folder`/run; returns the exit code."""
+    from tpcd.cli import run
+
+    left = iter(links)
+    monkeypatch.setattr("tpcd.robot.ur.Link", lambda *_: next(left))
+    few = {"sampler": FEW, "closing": replace(FEW, draws=600)}
+    monkeypatch.setattr(
+        "tpcd.commands.exploring.EstimatorSettings", partial(EstimatorSettings, **few)
+    )
+    script = load_script("robot")
+    words = (
+        "--robot", "springy", "--origin", "0.4", "0", "0.1", "--yes", "--noise_free", "--prior",
+        PRIOR, "--policy", "random", "--out", str(folder / "run"), "--surface_mm_per_10n", "5",
+    )  # fmt: skip
+
+    def call(*more: str) -> int:
+        with pytest.raises(SystemExit) as stopped:
+            run(script.explore_with_robot, script.Experiment, [*words, *more], prog="robot.py")
+        return int(stopped.value.code or 0)
+
+    return call
 
 
 def wired_arm(
@@ -205,7 +244,8 @@ def touching(settings: EmulatorSettings, force_x: float = 0.0, force_z: float = 
 def pressing(folder: Path, **stated: Any) -> tuple[UniversalRobot, Springy]:
     """An arm between two moves that presses on the floor with 1 N."""
     link = Springy(PRESSED)
-    stated = {"surface_mm_per_10n": 5.0, "retreat": 0.003, "still_time": 0.3, **stated}
+    stated = {"surface_mm_per_10n": 5.0, "retreat": 0.003, "still_time": 0.3, "noise_free": True,
+              **stated}  # fmt: skip
     settings = ArmSettings("springy", **stated)
     arm = UniversalRobot(settings, folder, lambda _: True)
     arm._link = link
@@ -232,7 +272,11 @@ def wired_servo(law: AdmittanceSettings | None = None, **changed: Any) -> tuple[
     """A servo that stands at the start of an emulated scene, and the controller behind it."""
     settings = emulator_settings(**changed)
     controller = Controller(settings)
-    stated = ArmSettings("wired", surface_mm_per_10n=settings.surface_mm_per_10n)
+    stated = ArmSettings(
+        "wired",
+        surface_mm_per_10n=settings.surface_mm_per_10n,
+        noise_free=settings.force_noise == 0.0,
+    )
     frame = emulated_frame(settings)
     servo = Servo(stated, Wired(controller, stated.rate), frame, RawRecord())
     servo._law = law or servo._law

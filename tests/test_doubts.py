@@ -14,6 +14,8 @@ from command_calls import PRIOR, call, make_world
 from made_logs import Setting, an_episode, in_space, sampled, write_csv
 from test_import_command import importing
 
+from tpcd.belief.belief import EstimationStep
+from tpcd.commands.estimation import EstimationRun
 from tpcd.commands.plausibility import run_warnings
 from tpcd.data import Episode, check_episode, read_episode, write_episode
 from tpcd.data.doubts import doubts_told, parse_doubts
@@ -121,6 +123,31 @@ def test_every_command_that_reads_it_repeats_them_in_one_line(
     assert call("predict", *clean) == 0
     (line,) = one_line(capsys.readouterr().err)
     assert "was learnt from an episode with doubts: part3.csv was accepted" in line
+
+
+def test_an_estimate_that_was_stopped_keeps_them_and_goes_on_with_them(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, add = str(tmp_path / "run"), EstimationRun.add
+
+    def stopped(self: EstimationRun, step: EstimationStep, *rest: object) -> None:
+        if step.index == 2:
+            raise KeyboardInterrupt
+        add(self, step, *rest)
+
+    words = (str(world / "part3.csv"), "--prior", PRIOR, "--out", out, "--particles", "60")
+    with monkeypatch.context() as patch:
+        patch.setattr(EstimationRun, "add", stopped)
+        assert call("estimate", *words) == 130
+    assert len(one_line(capsys.readouterr().err)) == 1
+    for again in (False, True):
+        if again:
+            assert call("estimate", *words, "--resume") == 0
+            assert len(one_line(capsys.readouterr().err)) == 1
+        target = str(tmp_path / f"{again}.csv")
+        assert call("predict", out, str(world / "test.csv"), "--out", target) == 0
+        (line,) = one_line(capsys.readouterr().err)
+        assert "run was learnt from an episode with doubts: part3.csv was accepted" in line
 
 
 @pytest.fixture(scope="module")

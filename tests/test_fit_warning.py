@@ -108,6 +108,17 @@ def test_a_recording_of_another_scene_is_told_with_its_figures_and_one_of_the_sa
             assert results["fits"][0]["fits"] is not foreign
             assert (results["warnings"][0] is not None) is foreign
             assert len(results["scores"]) == 6
+    # Of several it is the one that is foreign, wherever it stands.
+    for order in ((world / "test.csv", path), (path, world / "test.csv", world / "explore.csv")):
+        target = tmp_path / f"several{len(order)}.csv"
+        named = map(str, order)
+        assert call("predict", str(world / "run"), *named, "--out", str(target)) == 0
+        shown = capsys.readouterr().err
+        lines = [line for line in shown.splitlines() if "does not fit this belief" in line]
+        assert len(lines) == 1 and lines[0].startswith("warning: other.csv: ")
+        results = read_json(target.with_name(f"{target.name}.json"))
+        assert [fit["fits"] for fit in results["fits"]] == [one != path for one in order]
+        assert [told is None for told in results["warnings"]] == [one != path for one in order]
 
 
 def with_misfit(belief: Belief, misfit: float) -> Belief:

@@ -7,14 +7,19 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_calls import PRIOR, load_script
-from robot_bench import SURFACE, emulator_settings
+from command_calls import PRIOR, call, load_script
+from robot_bench import Springy, emulator_settings, springy_commands
 
 from tpcd.data.files import read_episode
+from tpcd.errors import RobotError
 from tpcd.robot.emulator import emulated_scene
 from tpcd.robot.emulator.process import running_emulator
+from tpcd.robot.link import Sample
+
+pytestmark = pytest.mark.usefixtures("types_unchecked")
 
 pytest.importorskip("rtde_control")
+START = (0.0, 0.06, 0.0)
 
 
 def robot_command(*arguments: str) -> int:
@@ -52,29 +57,62 @@ def test_the_whole_experiment_of_fifteen_moves(
     assert summary["friction"]["mean"] == pytest.approx(theta["friction"], abs=0.15)
 
 
+class Struck(Springy):
+    """An arm to which something happens in the move after a row was kept."""
+
+    def __init__(self, error: BaseException, row: Path, drift: float = 0.0) -> None:
+        super().__init__(START, drift)
+        self._error, self._row, self._left = error, row, 20
+
+    def next_sample(self) -> Sample:
+        self._left -= self._row.is_file()
+        if self._left == 0:
+            raise self._error
+        return super().next_sample()
+
+
 def test_a_fault_in_the_command_is_one_line_and_goes_on_with_resume(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
-    failing = emulator_settings(fault="protective_stop", fault_after=23.0)
-    arguments = (
-        "--origin", *map(str, failing.origin), "--yes", "--surface_mm_per_10n", str(SURFACE),
-        "--stale_time", "1", "--prior", PRIOR, "--policy", "random", "--out", str(out),
-        "--steps", "5",
-    )  # fmt: skip
-    with running_emulator(failing):
-        assert robot_command("--robot", failing.address, *arguments) == 2
+    failing = Struck(RobotError("springy: protective stop"), out / "raw" / "row_001.parquet")
+    explore = springy_commands(monkeypatch, [failing, Springy(START)], tmp_path)
+    assert explore("--steps", "3") == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and "protective stop" in lines[0] and "--resume" in lines[0]
     before = read_episode(out / "explore.csv")
-    assert 2 <= len(before) < 6  # A start takes 14 s
-    sound = emulator_settings()
-    with running_emulator(sound):
-        assert robot_command("--robot", sound.address, *arguments, "--resume") == 0
+    assert len(before) == 2
+    assert explore("--steps", "3", "--resume") == 0
     after = read_episode(out / "explore.csv")
-    assert len(after) == 6
+    assert len(after) == 4 and after.doubts == ()
     torch.testing.assert_close(after.poses[: len(before)], before.poses)
-    assert len((out / "steps.jsonl").read_text().splitlines()) == 5
+    assert len((out / "steps.jsonl").read_text().splitlines()) == 3
+
+
+def test_doubts_of_a_stopped_run_stay_with_it_and_are_told_by_all_that_comes_after(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sensor drifts in the first session, and in the second no more."""
+    out = tmp_path / "run"
+    drifting = Struck(KeyboardInterrupt(), out / "raw" / "row_002.parquet", drift=0.01)
+    explore = springy_commands(monkeypatch, [drifting, Springy(START)], tmp_path)
+    assert explore("--steps", "3") == 130
+    told = capsys.readouterr().err
+    assert "the sensor's zero has drifted: F_z reads " in told and "retreated" in told
+    stopped = read_episode(out / "explore.csv")
+    assert len(stopped) == 3
+    (doubt,) = stopped.doubts
+    assert "to 2 are off by 0.0" in str(doubt)
+    predict = ("predict", str(out), str(out / "explore.csv"))
+    assert call(*predict, "--out", str(tmp_path / "a.csv")) == 0
+    assert "was learnt from an episode with doubts: explore.csv was" in capsys.readouterr().err
+    assert explore("--steps", "3", "--resume") == 0
+    assert str(doubt) in capsys.readouterr().err
+    whole = read_episode(out / "explore.csv")
+    assert len(whole) == 4 and list(map(str, whole.doubts)) == [str(doubt)]
+    assert call(*predict, "--out", str(tmp_path / "b.csv")) == 0
+    (line,) = [each for each in capsys.readouterr().err.splitlines() if "learnt from" in each]
+    assert line.endswith(f"explore.csv was accepted in spite of 1 doubt: doubt: {doubt}")
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,9 @@ from tpcd.robot.servo import Servo
 from tpcd.robot.ur import UniversalRobot
 
 pytest.importorskip("rtde_control")
+NOWHERE = ArmSettings("nowhere", noise_free=True)
+AWAY = (-0.015, 0.03, 0.0)
+"""The way of a retreat [m, m, rad]."""
 
 
 def press_until_it_fails(arm: UniversalRobot) -> tuple[str, float]:
@@ -63,6 +66,7 @@ def test_a_lost_link_is_noticed_at_once_though_the_client_serves_the_last_pose(
     [
         ("wrong_payload", "payload is wrong by about 0.[78]"),
         ("drifting_sensor", r"drifts by 0\.[56]"),
+        ("frozen_sensor", "sensor has stopped: F_x, .* repeat .*; the arm holds its place"),
     ],
 )
 def test_a_sensor_that_zeroing_does_not_mend_is_refused(
@@ -70,6 +74,14 @@ def test_a_sensor_that_zeroing_does_not_mend_is_refused(
 ) -> None:
     with arm_with(tmp_path, fault=fault) as arm, pytest.raises(RobotError, match=said):
         arm.start()
+
+
+def test_a_wrench_that_is_no_number_any_more_ends_in_a_retreat(tmp_path: Path) -> None:
+    with arm_with(tmp_path, fault="no_numbers") as arm:
+        text, _ = press_until_it_fails(arm)
+    assert "no number" in text and "the arm has retreated" in text
+    retreat, _ = raw_of(tmp_path, "retreat")
+    assert retreat["z"][-1] > retreat["z"][0] + 0.029 and np.isnan(retreat["F_z"]).all()
 
 
 def test_a_surface_stiffer_than_stated_is_detected_and_left(tmp_path: Path) -> None:
@@ -119,7 +131,7 @@ def test_the_force_limit_holds_again_after_a_retreat_that_fails() -> None:
         Sample(0.008 * k, tcp, np.array([0.0, 0.0, force, 0.0, 0.0, 0.0]), tcp, 0.0)
         for k, force in enumerate(forces)
     ]
-    servo = Servo(ArmSettings("nowhere"), StubLink(samples), frame, RawRecord())
+    servo = Servo(NOWHERE, StubLink(samples), frame, RawRecord())
     servo.state = at_rest(place, np.zeros(3))
     with pytest.raises(RobotError, match="met a force of 40"):
         servo.retreat()
@@ -133,10 +145,10 @@ def test_a_force_about_the_limit_does_not_end_a_retreat() -> None:
     frame = task_frame(np.array([0.4, 0.0, 0.1, np.pi, 0.0, 0.0]))
     place = np.array([0.1, 0.1, 0.0])
     link = FollowingLink(tcp_pose(frame, place), (25.0, 19.0, 21.0, 21.0, 21.0))
-    servo = Servo(ArmSettings("nowhere"), link, frame, RawRecord())
+    servo = Servo(NOWHERE, link, frame, RawRecord())
     servo.state = at_rest(place, np.zeros(3))
-    raised = servo.retreat() - place
-    np.testing.assert_allclose(raised, (0.0, ArmSettings("nowhere").retreat, 0.0), atol=1e-9)
+    servo.retreat()
+    np.testing.assert_allclose(servo.state.reference - place, AWAY, atol=1e-9)
 
 
 def test_a_retreat_between_two_blows_of_a_swing_goes_on() -> None:
@@ -146,15 +158,16 @@ def test_a_retreat_between_two_blows_of_a_swing_goes_on() -> None:
 
     def retreat(forces: tuple[float, ...]) -> np.ndarray:
         link = FollowingLink(tcp_pose(frame, place), forces)
-        servo = Servo(ArmSettings("nowhere"), link, frame, RawRecord())
+        servo = Servo(NOWHERE, link, frame, RawRecord())
         servo.state = at_rest(place, np.zeros(3))
         for _ in range(20):
             servo.read()
-        return servo.retreat() - place
+        servo.retreat()
+        return servo.state.reference - place
 
     swing = (1.0,) * 9 + (17.5,) + (1.0,) * 10
     raised = retreat((*swing, 1.0, 17.5, 1.0))
-    np.testing.assert_allclose(raised, (0.0, ArmSettings("nowhere").retreat, 0.0), atol=1e-9)
+    np.testing.assert_allclose(raised, AWAY, atol=1e-9)
     with pytest.raises(RobotError, match="met a force of 17.5"):
         retreat((*(1.0,) * 20, 1.0, 17.5, 1.0))
 
@@ -172,7 +185,7 @@ def test_single_readings_are_guarded(pose: tuple, force: float, said: str) -> No
     wrench = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
     tcp = tcp_pose(frame, np.array(pose))
     samples = [Sample(0.008 * k, tcp, wrench, tcp, 0.0) for k in range(3)]
-    servo = Servo(ArmSettings("nowhere"), StubLink(samples), frame, RawRecord())
+    servo = Servo(NOWHERE, StubLink(samples), frame, RawRecord())
     if said == "does not follow":
         servo.state = at_rest(np.array([0.1, 0.1, 0.0]), np.zeros(3))
     with pytest.raises(RobotError, match=said):

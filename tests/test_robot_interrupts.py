@@ -22,6 +22,8 @@ from tpcd.robot import link as link_module
 from tpcd.robot import servo as servo_module
 from tpcd.robot.held_signals import HeldSignals, kill_as_ctrl_c
 
+pytestmark = pytest.mark.usefixtures("types_unchecked")
+
 TRACED = [module.__file__ for module in (guard, held_signals, link_module, raw, servo_module, ur)]
 """What these call is arithmetic, a part of their lines."""
 

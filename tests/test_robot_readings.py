@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from robot_bench import wired_arm
+from robot_bench import STATED_TIME, check_rest, command, pressing, wired_arm
 
 from tpcd.errors import RobotError
 from tpcd.robot.preflight import FreeAir, longest_repeat
@@ -43,10 +43,84 @@ def test_a_wrench_that_has_stopped_stops_the_arm_before_it_presses(tmp_path: Pat
         return replace(sample, wrench=first[0])
 
     altered(arm, frozen)
-    with pytest.raises(RobotError, match="the force sensor repeats .* it has stopped"):
+    with pytest.raises(RobotError, match="the force sensor has stopped: F_x, .* exactly"):
         arm.settle(start - torch.tensor([0.0, 0.06, 0.0], dtype=torch.float64))
     assert arm.at_rest is not None
     assert abs(controller._load[:3]).max() < 2.0
+
+
+@pytest.mark.parametrize("channels", [range(6), [0], [2], [4]])
+def test_a_sensor_that_stands_still_from_the_start_is_refused_before_the_arm_moves(
+    tmp_path: Path, channels: Any
+) -> None:
+    arm, controller = wired_arm(tmp_path)
+
+    def frozen(_: int, sample: Any) -> Any:
+        wrench = sample.wrench.copy()
+        wrench[channels] = 0.7
+        return replace(sample, wrench=wrench)
+
+    altered(arm, frozen)
+    names = np.array(["F_x", "F_y", "F_z", "M_x", "M_y", "M_z"])[channels]
+    with pytest.raises(RobotError, match=f"stopped: {', '.join(names)} of the base.*noise_free"):
+        arm.start()
+    assert controller.servo_time == 0.0
+
+
+def test_a_sensor_without_noise_works_where_it_is_said_to_have_none(tmp_path: Path) -> None:
+    arm, _ = wired_arm(tmp_path, force_noise=0.0, pose_noise=0.0)
+    assert arm.settings.noise_free
+    x, z, _ = arm.start().poses[0].tolist()
+    assert arm.settle(command(x, z + 0.01)).settled
+    arm.stop()
+    assert arm.at_rest == "the arm has retreated" and arm.doubts() == ()
+
+
+@pytest.mark.parametrize(("channel", "name"), [(0, "x"), (2, "z"), (5, "phi")])
+def test_a_pose_that_does_not_change_while_the_arm_moves_is_refused_by_name(
+    tmp_path: Path, channel: int, name: str
+) -> None:
+    """Of a tool that points down the third part of the rotation vector is nearly the angle."""
+    arm, controller = wired_arm(tmp_path)
+    first: list[float] = []
+
+    def frozen(_: int, sample: Any) -> Any:
+        tcp = sample.tcp.copy()
+        first.append(tcp[channel])
+        tcp[channel] = first[0]
+        return replace(sample, tcp=tcp)
+
+    altered(arm, frozen)
+    with pytest.raises(RobotError, match=f"{name} is -?[0-9]+ .* or this reading of its pose has"):
+        arm.start()
+    assert abs(controller._load).max() < 1e-9
+
+
+@pytest.mark.parametrize("channels", ["wrench", "tcp", "both", "F_x"])
+def test_readings_that_are_no_numbers_any_more_end_a_move_in_a_retreat(
+    tmp_path: Path, channels: str
+) -> None:
+    """The arm is away from what it presses on, and does not just hold its place there."""
+    arm, link = pressing(tmp_path)
+    read, lost = link.next_sample, []
+
+    def without() -> Any:
+        sample = read()
+        if link.sent < 20:
+            return sample
+        lost.append(link.time)
+        wrench = np.full(6, NAN)
+        if channels == "F_x":
+            wrench[1:] = sample.wrench[1:]
+        change = {"wrench": wrench} if channels != "tcp" else {}
+        return replace(sample, **change, **({"tcp": wrench} if channels in ("tcp", "both") else {}))
+
+    link.next_sample = without  # type: ignore[method-assign]
+    with pytest.raises(RobotError, match="a reading that is no number.*; the arm has retreated"):
+        arm.settle(command(0.1, -0.05))
+    assert link.time - lost[0] < STATED_TIME
+    check_rest(arm, link, 0.0)
+    assert arm.doubts() == ()
 
 
 @pytest.mark.parametrize("channel", ["wrench", "tcp"])

@@ -13,6 +13,8 @@ from tpcd.robot.admittance import advance, at_rest, settings_for_surface, travel
 from tpcd.robot.emulator import emulated_scene
 from tpcd.robot.servo import Servo
 
+pytestmark = pytest.mark.usefixtures("types_unchecked")
+
 STIFFNESS = (100.0, 100.0, 50.0)
 
 

@@ -41,6 +41,8 @@ from tpcd.robot.raw import RawRecord
 from tpcd.robot.ur import UniversalRobot
 from tpcd.shape.checkpoint import load_prior
 
+pytestmark = pytest.mark.usefixtures("types_unchecked")
+
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
 

@@ -20,6 +20,8 @@ from tpcd.robot.command_way import LEAD, PACE, command_way, moved_on
 from tpcd.robot.emulator import emulated_scene
 from tpcd.terrain import floor, wall
 
+pytestmark = pytest.mark.usefixtures("types_unchecked")
+
 LAW = settings_for_surface((100.0, 100.0, 50.0), 5e3)
 YIELDS = 3.0
 """Of floor and wall, across and along [mm per 10 N]."""

@@ -14,8 +14,10 @@ from tpcd.errors import RobotError
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.emulator import controller as emulated
 from tpcd.robot.emulator import emulated_scene
+from tpcd.robot.free_space import check_room, lifted
 from tpcd.robot.preflight import FreeAir, touch
-from tpcd.robot.zeroing import check_room, lifted
+
+pytestmark = pytest.mark.usefixtures("types_unchecked")
 
 RATE, NOISE = 125.0, np.array([0.2, 0.2, 0.01])
 START, HIGHER = np.array([0.0, 0.06, 0.0]), np.array([-0.015, 0.09, 0.0])

@@ -20,6 +20,7 @@ from command_calls import PRIOR, ROOT, call
 from short_episode import short_episode
 
 from eval.opened import shared_run
+from tpcd.commands.estimation import EstimationRun
 from tpcd.data.files import write_episode
 from tpcd.errors import RunError
 from tpcd.ownership import owned
@@ -43,7 +44,7 @@ import sys
 sys.path[:0] = ["tests"]
 from command_calls import call
 from tpcd.commands.estimation import EstimationRun
-add = EstimationRun.add
+add, EstimationRun._close = EstimationRun.add, lambda *_: None
 def slowly(self, step, *rest):
     if step.index == 1:
         print("begun", flush=True)
@@ -91,8 +92,9 @@ def finished_run(folder: Path) -> Path:
 
 
 def test_of_two_estimates_into_one_folder_the_second_is_refused_and_the_first_is_whole(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(EstimationRun, "_close", lambda *_: None)  # as in the other process
     write_episode(short_episode(3), tmp_path / "mug")
     run, alone = tmp_path / "run", tmp_path / "alone"
     words = (str(tmp_path / "mug.csv"), "--prior", PRIOR, "--particles", "50")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from contextlib import closing, nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
+
+from tqdm import tqdm
 
 from tpcd.belief import EstimatorSettings
 from tpcd.belief.belief import Belief
@@ -18,6 +20,7 @@ from tpcd.commands.drawing import KnownTruth
 from tpcd.commands.exploration_run import Kept, Stopping, run_exploration
 from tpcd.commands.exploring_options import ExploringOptions
 from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
+from tpcd.commands.plausibility import keep_doubts
 from tpcd.commands.summary import parameter_rows
 from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
@@ -27,6 +30,7 @@ from tpcd.exploration import Estimator, explore
 from tpcd.policies import Limits
 from tpcd.policies.active import Task
 from tpcd.policies.protocol import Policy
+from tpcd.quality.finding import Finding
 from tpcd.results import RESULTS_FILE, format_table, resumed_run, run_folder, write_results
 from tpcd.robot.protocol import Robot, stopped_first
 from tpcd.shape.checkpoint import load_prior
@@ -46,6 +50,46 @@ class Stage:
     """What the files of the rows so far hold, for `write_together`."""
     truth: KnownTruth | None = None
     """What a simulation knows; printed and drawn beside the belief."""
+
+
+class WrittenRows:
+    """The episode of an exploration as it is written, with what is doubtful of it. As a context it
+    tells and writes at the end what the last stop of the robot has brought to light."""
+
+    def __init__(self, path: Path, stage: Stage, before: tuple[Finding, ...]) -> None:
+        """`before` are the doubts of the rows that a run goes on after."""
+        self._path, self._stage, self._before = path, stage, before
+        self._rows: Episode | None = None
+        self._told: set[str] = set()
+        self._tell(before)
+
+    def write(self, rows: Episode) -> None:
+        """Write all rows so far. Doubts that are new are told first, those that grow at the end."""
+        doubts = (*self._before, *self._stage.robot.doubts())
+        self._tell(doubt for doubt in doubts if not self._told.intersection(doubt.channels))
+        self._keep(replace(rows, doubts=doubts, path=self._path))
+
+    def __enter__(self) -> WrittenRows:
+        return self
+
+    def __exit__(self, kind: object, *error: object) -> None:
+        doubts = (*self._before, *self._stage.robot.doubts())
+        self._tell(doubts)
+        if self._rows is not None and doubts != self._rows.doubts:
+            # What failed first is what ends the run.
+            with nullcontext() if kind is None else suppress(Exception):
+                self._keep(replace(self._rows, doubts=doubts))
+
+    def _keep(self, rows: Episode) -> None:
+        self._rows = rows
+        write_together(self._stage.contents(rows))
+        keep_doubts(rows, self._path.parent)
+
+    def _tell(self, doubts: Iterable[Finding]) -> None:
+        for doubt in doubts:
+            if str(doubt) not in self._told:
+                tqdm.write(f"warning: {doubt.weight.value}: {doubt}", file=sys.stderr)
+                self._told.update((str(doubt), *doubt.channels))
 
 
 def explore_in_folder(
@@ -80,10 +124,12 @@ def explore_in_folder(
         settings = EstimatorSettings(step=model.step, effects=model.informed, shape=model.shape)
         estimator = Estimator(shape, options.estimator, settings)
         kept = _kept(folder, estimator, options.prior) if options.resume else Kept()
+        before = () if kept.episode is None else kept.episode.doubts
         done = 0 if kept.state is None else kept.state.index
         if done >= options.steps and (folder / RESULTS_FILE).is_file():
             raise ValueError(f"{options.out} has all of its {options.steps} moves; raise --steps")
         on_stage = stage(folder, limits, task)
+        rows = WrittenRows(folder / f"{EPISODE_NAME}.csv", on_stage, before)
         steps = explore(
             on_stage.robot,
             on_stage.policy,
@@ -92,12 +138,12 @@ def explore_in_folder(
             kept.episode,
             kept.belief,
             kept.state,
-            lambda rows: write_together(on_stage.contents(rows)),
+            rows.write,
             options.stop_gain or 0.0,
         )
         robot = on_stage.robot
         try:
-            with closing(robot), stopped_first(robot.stop):
+            with rows, closing(robot), stopped_first(robot.stop):
                 belief, episode, reason = run_exploration(
                     steps,
                     Stopping(options.steps, options.stop_error),

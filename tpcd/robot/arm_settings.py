@@ -46,8 +46,11 @@ class ArmSettings:
     get on, on top of the way at full speed [s]."""
     still_time: float = 3.0
     """Time in free air from which noise is measured [s]."""
+    noise_free: bool = False
+    """Whether the readings of the force sensor have no noise, as an emulator's may; otherwise one
+    that repeats exactly is of a sensor that has stopped."""
     retreat: float = 0.03
-    """How far the arm moves away after a stop [m]."""
+    """How far the arm moves up after a stop, and half as far to the left [m]."""
     resume_tolerance: tuple[float, float] = (1.5e-3, 0.015)
     """How far poses of repeated moves may be from those of an earlier run [m, rad]."""
     priors: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from tpcd.errors import RobotError, TpcdError
 from tpcd.robot.held_signals import HeldSignals
+from tpcd.robot.preflight import FreeAir
 from tpcd.robot.raw import RawRecord
 from tpcd.robot.servo import Servo
 
@@ -35,6 +36,8 @@ class Guard:
         """How the arm was left after a stop; None while it may be moved."""
         self.row = 0
         """The row that is being measured, for the record."""
+        self.in_air: FreeAir | None = None
+        """What was read in free air at the end of the retreat, where it was."""
         self._folder, self._left, self._leaving = folder, False, threading.RLock()
         self._retreat: RawRecord | None = None
         """Readings of the retreat, until they are kept."""
@@ -117,7 +120,7 @@ class Guard:
             try:
                 if servo is not None and servo.state is not None and servo.link.alive:
                     servo.record = self._retreat = RawRecord()
-                    servo.retreat()
+                    self.in_air = servo.retreat()
                     self.at_rest = RETREATED
             except BaseException as error:
                 ended = error

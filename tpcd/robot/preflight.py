@@ -16,10 +16,9 @@ from scipy.stats import chi2
 
 from tpcd.errors import RobotError
 from tpcd.quality.habit import find_habit
+from tpcd.robot.free_space import LARGEST_BEFORE_ZEROING
 from tpcd.robot.settling import SettlingSettings
 
-LARGEST_BEFORE_ZEROING = 10.0
-"""Force in free air that only a wrong payload or a contact explains [N]."""
 TOUCHING = (0.3, 0.3, 0.03)
 """Change of a wrench that is contact, where noise is smaller [N, N, N·m]: well below the 0.5 N that
 are never to be missed; of the torque what that is at a lever of 0.1 m."""
@@ -152,10 +151,10 @@ def reading_noise(air: FreeAir) -> Float[np.ndarray, " 3"]:
 
 
 def longest_repeat(air: FreeAir) -> float:
-    """For how many readings a working sensor repeats a wrench; infinite where it has no noise."""
-    # A sum with these weights changes where any of its parts does.
-    habit = find_habit(air.wrenches @ np.sqrt([1.0, 2.0, 3.0]), 0.0)
-    return habit.longest if habit.lively else np.inf
+    """For how many readings a working sensor repeats a number in any of its channels; 0 where free
+    air does not tell."""
+    habits = [find_habit(channel) for channel in air.wrenches.T]
+    return max(habit.longest if habit.lively else 0.0 for habit in habits)
 
 
 def mean_noise(

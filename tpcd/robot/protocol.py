@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.data.episode import Episode
+from tpcd.quality.finding import Finding
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,11 @@ class Robot(Protocol):
 
     def stop(self) -> None:
         """Stop all motion at once."""
+        ...
+
+    def doubts(self) -> tuple[Finding, ...]:
+        """What is doubtful of the rows measured since it started or went on; a stop may tell
+        more."""
         ...
 
     def close(self) -> None:

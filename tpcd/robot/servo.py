@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tpcd.errors import RobotError
@@ -30,6 +30,7 @@ from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.command_way import command_way, moved_on
 from tpcd.robot.frames import TaskFrame, planar_pose, planar_wrench
 from tpcd.robot.frames import tcp_pose as tcp_of
+from tpcd.robot.free_space import is_lifted, lifted
 from tpcd.robot.held_signals import HeldSignals
 from tpcd.robot.link import Link, Sample
 from tpcd.robot.preflight import FreeAir
@@ -41,6 +42,9 @@ MARGIN = (0.005, 0.005, 0.02)
 """How far a pose may be outside of the workspace before the arm stops [m, m, rad]."""
 FOLLOWING = (0.015, 0.015, 0.1)
 """How far the arm may be from its target: the delay's way at full speed, several times over."""
+ARRIVED = (0.001, 0.001, 0.005)
+"""The same where it has come to rest; one that does not follow, or whose reading has stopped, is
+further off after most moves [m, m, rad]."""
 RAMP_SPEED = 0.03
 """Of moves in free air [m/s]; of their angle, ten times that [rad/s]."""
 ARRIVING = 0.3
@@ -56,8 +60,12 @@ GENTLE = 2.5
 PROGRESS = 0.01
 """Share of the command's way whose time is limited, while the arm follows."""
 FROZEN = 0.1
-"""A wrench that repeats exactly for so long [s], and for longer than its own habit in free air
-allows, is of a sensor that has stopped."""
+"""A channel of the wrench that repeats exactly for so long [s], and for longer than its own habit in
+free air allows, is of a sensor that has stopped, unless its readings are said to have no noise."""
+IN_AIR = 0.2
+"""At the end of a retreat, over which the wrench in free air is read: `ARRIVING` less what a servo
+lags behind, three times over [s]."""
+WRENCH = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 LARGEST_STEP = 0.05
 """Of the admittance after a pause of this process [s]."""
 
@@ -86,14 +94,14 @@ class Servo:
         """Where the arm is sent; None while it is only read."""
         self.noise = np.zeros(3)
         """Standard deviation of single readings of the wrench [N, N, N·m]."""
-        self.longest_repeat = np.inf
-        """Readings of a working sensor that may repeat one wrench."""
-        self._over, self._slower, self._repeated = 0, 0, 0
-        self._last_wrench: np.ndarray | None = None
+        self.longest_repeat = 0.0
+        """Readings of a working sensor that may repeat one number."""
+        self._over, self._slower, self._repeated = 0, 0, np.zeros(6, dtype=int)
+        self._last_wrench = np.full(6, np.nan)
         self._retreating: int | None = None
         """Thread that makes the arm retreat."""
-        self._felt: deque[np.ndarray] = deque(maxlen=max(1, round(RECENT * link.rate)))
-        """Sizes of the last forces (2) [N]."""
+        self._recent: deque[np.ndarray] = deque(maxlen=max(1, round(RECENT * link.rate)))
+        """Stamps, poses (3) and wrenches (3) of the last readings."""
         self._command: np.ndarray | None = None
         """The last one given way to; None where the arm went elsewhere since."""
 
@@ -103,12 +111,14 @@ class Servo:
         frame, state = self.frame, self.state
         sample = self.link.next_sample()
         self._check_alive(sample)
-        pose, wrench = planar_pose(frame, sample.tcp), planar_wrench(frame, sample.wrench)
+        known = bool(np.isfinite(sample.tcp).all())
+        pose = planar_pose(frame, sample.tcp) if known else np.full(3, np.nan)
+        wrench = planar_wrench(frame, sample.wrench)
         reference = pose if state is None else state.reference
         # What cannot be kept ends a move, and no retreat.
         with suppress(Exception) if self._retreating else nullcontext():
             self.record.add(sample, pose, wrench, reference)
-        self._felt.append(np.abs(wrench[:2]))
+        self._recent.append(np.concatenate(([sample.stamp], pose, wrench)))
         limit = self.settings.stop_force * np.array([1.0, 1.0, 0.2])
         over = bool((np.abs(wrench) > limit).any()) and not self._retreating
         self._over = self._over + 1 if over else 0
@@ -117,30 +127,57 @@ class Servo:
                 f"a wrench of ({wrench[0]:.1f}, {wrench[1]:.1f} N, {wrench[2]:.2f} N·m), beyond the"
                 f" limit of {self.settings.stop_force:g} N"
             )
-        off = np.abs(pose - reference)
-        if bool((off > FOLLOWING).any()):
-            raise RobotError(
-                f"the arm is {1e3 * off[:2].max():.0f} mm and {1e3 * off[2]:.0f} mrad from its"
-                " target; it does not follow: look at speed slider, joint limits and collisions"
-            )
-        self.check_inside("the arm", pose, MARGIN)
+        self._check_near(pose, FOLLOWING)
+        if known:
+            self.check_inside("the arm", pose, MARGIN)
         return sample, pose, wrench
 
     def _check_alive(self, sample: Sample) -> None:
-        """Raises RobotError for readings that are no numbers, and for a wrench that has frozen."""
+        """Raises RobotError for readings that are no numbers, and for a wrench that has frozen. A
+        retreat goes by its targets: where the arm is sent is free, whatever is read there."""
+        same = sample.wrench == self._last_wrench
+        self._repeated = np.where(same, self._repeated + 1, 0)
+        self._last_wrench = np.array(sample.wrench)
+        if self._retreating:
+            return
         if not (np.isfinite(sample.tcp).all() and np.isfinite(sample.wrench).all()):
             raise RobotError(
                 f"a reading that is no number: pose {sample.tcp.tolist()}, wrench"
                 f" {sample.wrench.tolist()}"
             )
-        same = self._last_wrench is not None and np.array_equal(sample.wrench, self._last_wrench)
-        self._repeated = self._repeated + 1 if same else 0
-        self._last_wrench = np.array(sample.wrench)
-        frozen = self._repeated > max(FROZEN * self.link.rate, self.longest_repeat)
-        if frozen and not self._retreating:
+        if self._frozen.any():
+            still = [name for name, stopped in zip(WRENCH, self._frozen, strict=True) if stopped]
             raise RobotError(
-                f"the force sensor repeats {self._last_wrench[:3].tolist()} N exactly, where single"
-                f" readings scatter by {self.noise[:2].max():.2g} N: it has stopped"
+                f"the force sensor has stopped: {', '.join(still)} of the base repeat"
+                f" {self._last_wrench[self._frozen].tolist()} exactly; look at its cable and power,"
+                " or say that it is noise_free, as an emulator may be, or one whose steps hide it"
+            )
+
+    @property
+    def _frozen(self) -> Bool[np.ndarray, " 6"]:
+        frozen = self._repeated > max(FROZEN * self.link.rate, self.longest_repeat)
+        return np.zeros(6, dtype=bool) if self.settings.noise_free else frozen
+
+    def _check_near(
+        self, pose: Float[np.ndarray, " 3"], allowed: tuple[float, float, float]
+    ) -> None:
+        """Raises RobotError for a pose that is too far from where the arm was sent. What is no
+        number is near, since a retreat goes by its targets."""
+        if self.state is None:
+            return
+        off = pose - self.state.reference
+        far = np.abs(off) > allowed
+        if far.any():
+            shown = [
+                f"{name} is {size:.0f} {unit} from its target"
+                for name, unit, size, told in zip(
+                    ("x", "z", "phi"), ("mm", "mm", "mrad"), 1e3 * off, far, strict=True
+                )
+                if told
+            ]
+            raise RobotError(
+                f"{' and '.join(shown)}: the arm does not follow, or this reading of its pose has"
+                " stopped; look at speed slider, joint limits and collisions"
             )
 
     def stand(self, seconds: float) -> FreeAir:
@@ -169,8 +206,10 @@ class Servo:
             _, pose, wrench = self.read()
             state = self.state or at_rest(pose, np.zeros(3))
             force = np.abs(wrench[:2])
-            before = force if before is None else before
-            if float((force - before).max()) > allowed:
+            if before is None or not np.isfinite(before).all():
+                before = force
+            # Of a force that is no number a retreat knows nothing, and goes on.
+            if bool((force - before > allowed).any()):
                 raise RobotError(
                     f"the arm met a force of {force.max():.1f} N on its way through"
                     " what should be free air"
@@ -181,29 +220,38 @@ class Servo:
             reference = state.reference + way / max(1.0, float(steps))
             self.state = at_rest(reference, wrench)
             self._send(reference)
+        if not self._retreating:
+            self._check_near(pose, ARRIVED)
 
-    def retreat(self) -> Float[np.ndarray, " 3"]:
-        """Away from what may be touched, then up; the arm holds where the way is not free.
+    def retreat(self) -> FreeAir | None:
+        """Away from what may be touched, to the left and up, then up; the arm holds where the way
+        is not free. Returns what is read in the air, None where there was no room to leave what is
+        touched, or no sensor tells.
 
-        The world has a floor below and a wall on the right, and both may be felt only through
-        friction. So the way is up, and at first also to the left where the arm is pushed there.
+        Both may be felt only through friction, or not at all where the sensor has drifted or
+        stopped: so the way is the same whatever is felt.
         """
         assert self.state is not None, "never moved"
-        settings, here = self.settings, self.state.reference
+        here = self.state.reference
+        above = lifted(self.settings, here)
+        aside = here + np.array(
+            [above[0] - here[0], min(above[1] - here[1], here[0] - above[0]), 0]
+        )
         # The limit may be exceeded still: the ramp looks to the force.
         self._retreating = threading.get_ident()
-        felt = np.max(self._felt, axis=0) if self._felt else None
-        left = -1.0 if float(self.state.wrench[0]) < -1.0 else 0.0
-        low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
+        recent = np.array(self._recent)
+        felt = np.abs(recent[:, 4:6]).max(0) if len(recent) else None
         try:
-            for way in (np.array([left, 1.0, 0.0]), np.array([0.0, 1.0, 0.0])):
-                goal = here + 0.5 * settings.retreat * way
-                goal = np.clip(goal, np.minimum(low, here), np.maximum(high, here))
-                self.ramp_to(goal, RETREAT_FORCE, felt)
-                here, felt = self.state.reference, None
+            self.ramp_to(aside, RETREAT_FORCE, felt)
+            self.ramp_to(above, RETREAT_FORCE)
         finally:
             self._retreating = None
-        return here
+        rows = np.array(self._recent)
+        rows = rows[rows[:, 0] > rows[-1, 0] - IN_AIR]
+        free = is_lifted(self.settings, here, self.state.reference)
+        if not free or self._frozen.any() or not np.isfinite(rows).all():
+            return None
+        return FreeAir(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
 
     def settle(self, command: Float[np.ndarray, " 3"]) -> Reading:
         """Give way to a command until pose and force are steady, and average them."""
@@ -254,6 +302,8 @@ class Servo:
                 break
         settled = still is not None
         still = still or window.mean()
+        if settled:
+            self._check_near(still.pose, ARRIVED)
         return Reading(
             tensor_of(still.pose), tensor_of(still.wrench), settled, stamps=(still.start, still.end)
         )

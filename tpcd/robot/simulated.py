@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.data.episode import Episode
+from tpcd.quality.finding import Finding
 from tpcd.random import stream
 from tpcd.robot.protocol import Reading
 from tpcd.truth.protocol import Truth
@@ -82,6 +83,10 @@ class SimulatedRobot:
 
     def stop(self) -> None:
         """Nothing moves between commands."""
+
+    def doubts(self) -> tuple[Finding, ...]:
+        """None: its sensors are as stated."""
+        return ()
 
     def close(self) -> None:
         """Nothing to let go of."""

@@ -20,15 +20,18 @@ from torch import Tensor
 from tpcd.data.episode import Episode
 from tpcd.errors import RobotError
 from tpcd.files import read_json, write_json
+from tpcd.quality.finding import Finding
 from tpcd.robot import preflight
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.frames import TaskFrame, out_of_plane, planar_pose, task_frame
+from tpcd.robot.free_space import check_room, lifted
 from tpcd.robot.guard import Guard
 from tpcd.robot.link import Link
 from tpcd.robot.protocol import Reading, stopped_first
 from tpcd.robot.raw import RawRecord
 from tpcd.robot.servo import Servo, tensor_of
-from tpcd.robot.zeroing import Lifted, check_room, lift, lifted, turning_force, zeroed_at
+from tpcd.robot.zero_watch import ZeroWatch
+from tpcd.robot.zeroing import Lifted, lift, turning_force, zeroed_at
 
 FRAME_FILE = "frame.json"
 
@@ -46,7 +49,10 @@ class UniversalRobot:
         self._guard = Guard(folder)
         self._link: Link | None = None
         self._first: np.ndarray | None = None
-        self._std = torch.zeros(6, dtype=torch.float64)
+        self._std, self._turning = torch.zeros(6, dtype=torch.float64), 0.0
+        self._zero: ZeroWatch | None = None
+        self._before, self._first_new = 0, 0
+        """Moves before the present episode, and its first row that this session measures."""
         self._notes = settings.notes
 
     @property
@@ -93,7 +99,8 @@ class UniversalRobot:
         servo, first = self._require_servo(), self._first
 
         def back() -> Episode:
-            self._go_above(servo, first, float(servo.retreat()[1]))
+            servo.retreat()
+            self._go_above(servo, first, float(servo.state.reference[1]))
             return self._zero_at(servo, first)
 
         return self._guard.move(f"back_{self._guard.row:03d}", back)
@@ -109,11 +116,15 @@ class UniversalRobot:
         servo = self._require_servo()
         servo.check_inside("a command", target)
         self._guard.row += 1
-        return self._guard.move(
-            f"row_{self._guard.row:03d}",
-            lambda: replace(servo.settle(target), sensor_std=self._std),
-            command=target.tolist(),
-        )
+
+        def measured() -> Reading:
+            reading = replace(servo.settle(target), sensor_std=self._std)
+            if self._zero is not None:
+                self._zero.moved(self._guard.row - self._before, reading)
+            return reading
+
+        name = f"row_{self._guard.row:03d}"
+        return self._guard.move(name, measured, command=target.tolist())
 
     def resume(self, episode: Episode) -> None:
         """Start, go to the earlier start pose and repeat the moves, since friction keeps the path.
@@ -134,6 +145,7 @@ class UniversalRobot:
                 " earlier rows; bring it back there in free air"
             )
         servo, first = self._begin(frame), episode.poses[0].numpy()
+        self._first_new = len(episode)
 
         def back() -> None:
             here = lift(servo).start
@@ -150,8 +162,9 @@ class UniversalRobot:
                     raise self._guard.refusal(
                         f"repeating move {row} ends {1e3 * float(off[:2].max()):.1f} mm and"
                         f" {1e3 * float(off[2]):.0f} mrad from where it did, expected at most"
-                        f" {1e3 * length:g} mm and {1e3 * angle:g} mrad; the object has slipped or"
-                        " the place has moved, so start a new exploration",
+                        f" {1e3 * length:g} mm and {1e3 * angle:g} mrad; the object has slipped,"
+                        " the place has moved, or the sensor's zero was another: start a new"
+                        " exploration",
                         resumable=False,
                     )
 
@@ -162,6 +175,11 @@ class UniversalRobot:
         """
         if self._link is not None:
             self._guard.stop()
+
+    def doubts(self) -> tuple[Finding, ...]:
+        """Whether the sensor's zero has drifted since the present episode began, as far as it was
+        read in free air, at the latest by `stop`."""
+        return () if self._zero is None else self._zero.doubts(self._guard.in_air)
 
     def close(self) -> None:
         """Stop, end servo and script, and disconnect."""
@@ -233,8 +251,11 @@ class UniversalRobot:
         settings = self.settings
         air, there = zeroed_at(servo, start)
         if turning is not None:
-            stiffness = np.array(settings.stiffness)
+            self._turning, stiffness = turning, np.array(settings.stiffness)
             self._std = tensor_of(preflight.row_noise(air, turning, servo.settling, stiffness))
+        std = self._std.numpy()
+        self._zero = ZeroWatch(air, there, std, servo.noise, self._turning, self._first_new)
+        self._before = self._guard.row
         first = self._first = there.poses.mean(0)
         pose, wrench = tensor_of(first), tensor_of(there.wrenches.mean(0))
         return Episode(

@@ -17,12 +17,9 @@ from jaxtyping import Float
 from tpcd.errors import RobotError
 from tpcd.robot import preflight
 from tpcd.robot.admittance import at_rest
-from tpcd.robot.arm_settings import ArmSettings
+from tpcd.robot.free_space import lifted
 from tpcd.robot.preflight import FreeAir
 from tpcd.robot.servo import RETREAT_FORCE, Servo
-
-SPARE = 0.002
-"""Way beyond what a surface yields, after which an arm that was lifted is free [m]."""
 
 
 @dataclass(frozen=True)
@@ -33,29 +30,6 @@ class Lifted:
     """The place [m, m, rad]."""
     touch: preflight.Touch
     """What is felt there."""
-
-
-def lifted(settings: ArmSettings, start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """The pose above a start pose and to its left at which the sensor is zeroed [m, m, rad], as
-    far as the workspace allows."""
-    low, high = np.array(settings.workspace_low), np.array(settings.workspace_high)
-    least = _least_way(settings)
-    way = np.array([-max(0.5 * settings.retreat, least), max(settings.retreat, least), 0.0])
-    return np.clip(start + way, np.minimum(low, start), np.maximum(high, start))
-
-
-def check_room(settings: ArmSettings, start: Float[np.ndarray, " 3"]) -> None:
-    """Raises RobotError where the workspace leaves too little way to leave a surface that yields as
-    stated under the largest force before zeroing."""
-    room, least = np.abs(lifted(settings, start) - start)[:2], _least_way(settings)
-    if float(room.min()) < least - 1e-9:
-        shown = ", ".join(f"{value:.3f}" for value in start)
-        raise RobotError(
-            f"the start pose is at ({shown}) [m, m, rad], where the workspace leaves"
-            f" {1e3 * room[0]:.0f} mm to the left and {1e3 * room[1]:.0f} mm above, expected"
-            f" {1e3 * least:.0f} mm of both, to zero the sensor free of contact; start elsewhere,"
-            " or widen the workspace"
-        )
 
 
 def lift(servo: Servo) -> Lifted:
@@ -108,7 +82,3 @@ def zeroed_at(servo: Servo, start: Float[np.ndarray, " 3"]) -> tuple[FreeAir, Fr
             " anew from a pose in free air"
         )
     return air, there
-
-
-def _least_way(settings: ArmSettings) -> float:
-    return 1e-4 * settings.surface_mm_per_10n * preflight.LARGEST_BEFORE_ZEROING + SPARE

@@ -32,6 +32,8 @@ WRONG_MASS = 0.8
 """What the controller does not know it carries under the fault wrong_payload [kg]."""
 DRIFT = 0.6
 """Of the force along the base's z under the fault drifting_sensor [N/s]."""
+FROZEN = 0.25
+"""Of each channel of the wrench under the fault frozen_sensor [N, N·m]."""
 GRAVITY = 9.81
 LEVER = 0.2
 """A turn counts as the way of a point so far away [m]."""
@@ -122,18 +124,24 @@ class Controller:
         settings, frame = self.settings, self._frame
         noise = settings.pose_noise * np.array([1, 1, 1, 2, 2, 2])
         tcp = tcp_pose(frame, self._actual)
+        pose = tcp + noise * self._random.standard_normal(6)
         running = PROGRAM_RUNNING if self.running else 0
         speed = np.zeros(6)
         speed[:3] = self._speed[0] * frame.x_axis + self._speed[1] * frame.z_axis
         speed[3:] = self._speed[2] * frame.normal
         force = settings.force_noise * np.array([1, 1, 1, 0.05, 0.05, 0.05])
         wrench = self._load - _turned(tcp, self._zero)
+        wrench = wrench + force * self._random.standard_normal(6)
+        if settings.fault == "frozen_sensor":
+            wrench = np.full(6, FROZEN)
+        elif self.is_due("no_numbers"):
+            wrench = np.full(6, np.nan)
         return {
             **self._output,
             "timestamp": self.time,
-            "actual_TCP_pose": (tcp + noise * self._random.standard_normal(6)).tolist(),
+            "actual_TCP_pose": pose.tolist(),
             "actual_TCP_speed": speed.tolist(),
-            "actual_TCP_force": (wrench + force * self._random.standard_normal(6)).tolist(),
+            "actual_TCP_force": wrench.tolist(),
             "target_TCP_pose": tcp_pose(frame, self._target).tolist(),
             "robot_mode": 7,
             "safety_mode": 3 if self.protective_stopped else 1,

@@ -18,6 +18,8 @@ Fault = Literal[
     "register_in_use",
     "wrong_payload",
     "drifting_sensor",
+    "frozen_sensor",
+    "no_numbers",
     "local_control",
 ]
 SCENE_STREAM = 0
@@ -49,7 +51,8 @@ class EmulatorSettings:
     payload: float = 0.5
     """Mass that the controller was told it carries [kg]."""
     force_noise: float = 0.2
-    """Standard deviation of one reading of a force [N]; of a torque a twentieth [N·m]."""
+    """Standard deviation of one reading of a force [N]; of a torque a twentieth [N·m]. With 0 the
+    arm has to be told that its sensor is noise_free."""
     pose_noise: float = 1e-5
     """Standard deviation of one reading of a position [m]; of an angle twice that [rad]."""
     servo_delay: float = 0.034

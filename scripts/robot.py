@@ -212,7 +212,10 @@ def _confirmed(config: Experiment, text: str) -> bool:
         return True
     if not sys.stdin.isatty():
         return False
-    return input("Type yes to let it move: ").strip().lower() == "yes"
+    try:
+        return input("Type yes to let it move: ").strip().lower() == "yes"
+    except EOFError:
+        return False
 
 
 if __name__ == "__main__":

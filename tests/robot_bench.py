@@ -196,11 +196,12 @@ def springy_commands(
     )
     script = load_script("robot")
     words = (
-        "--robot", "springy", "--origin", "0.4", "0", "0.1", "--yes", "--noise_free", "--prior",
+        "--robot", "springy", "--origin", "0.4", "0", "0.1", "--noise_free", "--prior",
         PRIOR, "--policy", "random", "--out", str(folder / "run"), "--surface_mm_per_10n", "5",
     )  # fmt: skip
 
-    def call(*more: str) -> int:
+    def call(*more: str, yes: bool = True) -> int:
+        more = (*more, *["--yes"] * yes)
         with pytest.raises(SystemExit) as stopped:
             run(script.explore_with_robot, script.Experiment, [*words, *more], prog="robot.py")
         return int(stopped.value.code or 0)

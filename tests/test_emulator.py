@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import struct
 import time
 
@@ -13,8 +14,17 @@ from robot_bench import emulator_settings, free_address
 
 from tpcd.errors import RobotError
 from tpcd.robot.emulator import EmulatorSettings, emulated_scene
+from tpcd.robot.emulator.controller import MOVE_L, Controller
 from tpcd.robot.emulator.process import running_emulator
-from tpcd.robot.emulator.protocol import DATA, Recipe, field_type, package, split_packages
+from tpcd.robot.emulator.protocol import (
+    DATA,
+    SETUP_INPUTS,
+    SETUP_OUTPUTS,
+    Recipe,
+    field_type,
+    package,
+    split_packages,
+)
 from tpcd.robot.emulator.surface import VERTEX_STIFFNESS, CompliantWorld, Plate
 from tpcd.robot.link import Link
 
@@ -183,6 +193,44 @@ def test_a_script_can_be_stopped_and_uploaded_again(clients) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert control.zeroFtSensor()
+
+
+def test_a_second_client_is_refused_and_the_first_goes_on(
+    clients, emulator: EmulatorSettings
+) -> None:
+    control, _ = clients
+    with pytest.raises(RobotError, match="registers are in use by another client"):
+        Link(emulator.address, 125.0)
+    assert control.isProgramRunning() and control.zeroFtSensor()
+
+
+@pytest.mark.parametrize(
+    ("port", "sent"),
+    [
+        (30004, package(SETUP_OUTPUTS, b"")),
+        (30004, package(SETUP_OUTPUTS, struct.pack(">d", 0.0) + b"timestamp")),
+        (30004, package(SETUP_INPUTS, b"\xff")),
+        (30004, package(SETUP_INPUTS, b"input_bit_register_64") + package(DATA, b"\1abc")),
+        (30004, package(DATA, b"")),
+    ],
+)
+def test_what_is_no_message_ends_its_connection_alone(
+    port: int, sent: bytes, clients, emulator: EmulatorSettings
+) -> None:
+    with socket.create_connection((emulator.address, port), timeout=10.0) as connection:
+        connection.sendall(sent)
+        while connection.recv(4096):
+            pass
+    assert clients[0].isProgramRunning()
+
+
+def test_a_target_that_is_no_number_is_a_protective_stop() -> None:
+    controller = Controller(emulator_settings())
+    controller.upload()
+    place = {f"input_double_register_{index}": float("nan") for index in range(6)}
+    controller.write({**place, "input_int_register_0": MOVE_L})
+    controller.advance()
+    assert controller.protective_stopped
 
 
 def test_a_target_out_of_the_plane_ends_in_a_protective_stop(clients) -> None:

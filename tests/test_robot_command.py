@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def test_the_whole_experiment_of_fifteen_moves(
     shown = capsys.readouterr()
     assert "all 15 moves are made" in shown.err and "wall_position" in shown.out
     episode = read_episode(out / "explore.csv")
-    assert len(episode) == 16
+    assert len(episode) == 16 and episode.doubts == ()
     assert len(list((out / "raw").glob("row_*.parquet"))) == 15
     summary = json.loads((out / "summary.json").read_text())["parameters"]
     theta = emulated_scene(emulator).theta
@@ -113,6 +114,35 @@ def test_doubts_of_a_stopped_run_stay_with_it_and_are_told_by_all_that_comes_aft
     assert call(*predict, "--out", str(tmp_path / "b.csv")) == 0
     (line,) = [each for each in capsys.readouterr().err.splitlines() if "learnt from" in each]
     assert line.endswith(f"explore.csv was accepted in spite of 1 doubt: doubt: {doubt}")
+
+
+def test_an_arm_that_does_not_come_away_at_the_end_of_a_run_is_told_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cable is pulled while the last move is learnt from; what was found is whole."""
+    row = tmp_path / "run" / "raw" / "row_001.parquet"
+    lost = Struck(RobotError("springy: no new reading for 40 ms"), row)
+    lost._left = 1
+    explore = springy_commands(monkeypatch, [lost], tmp_path)
+    assert explore("--steps", "1") == 0
+    told = capsys.readouterr().err
+    assert "warning: the arm holds its place, its way back not being free (springy: no new" in told
+    assert "all 1 moves are made" in told
+
+
+def test_no_answer_is_no_yes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Closed(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr("sys.stdin", Closed())
+    link = Springy(START)
+    explore = springy_commands(monkeypatch, [link], tmp_path)
+    assert explore(yes=False) == 2
+    (line,) = [each for each in capsys.readouterr().err.splitlines() if "error" in each]
+    assert "not confirmed" in line and link.sent == 0 and not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

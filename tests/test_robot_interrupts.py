@@ -183,19 +183,28 @@ def test_a_kill_in_a_move_is_as_ctrl_c_and_only_meanwhile(tmp_path: Path) -> Non
     check_rest(arm, link, 1.5)
 
 
-def test_signals_are_held_in_the_main_thread_alone(ctrl_c: None) -> None:
+def test_signals_are_held_and_let_go_of_in_the_main_thread_alone(ctrl_c: None) -> None:
     found: list[object] = []
 
     def elsewhere() -> None:
         signals = HeldSignals()
         signals.hold()
         found.append(signal.getsignal(signal.SIGINT))
+        held.look()
+        held.release()
         signals.release()
+        found.append(held._held)
 
+    held = HeldSignals()
+    held.hold()
+    signal.raise_signal(signal.SIGINT)
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
-    assert found == [signal.default_int_handler]
+    assert found == [held._take, True]
+    with pytest.raises(KeyboardInterrupt):
+        held.release()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_stopping_from_another_thread_ends_the_move_there(tmp_path: Path) -> None:

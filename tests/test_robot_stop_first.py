@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,6 +37,7 @@ from tpcd.errors import RobotError
 from tpcd.exploration import Estimator, explore
 from tpcd.policies.protocol import Choice, Situation
 from tpcd.robot import servo as servo_module
+from tpcd.robot.link import Link
 from tpcd.robot.protocol import stopped_first
 from tpcd.robot.raw import RawRecord
 from tpcd.robot.ur import UniversalRobot
@@ -211,6 +213,58 @@ def test_letting_go_of_an_arm_leaves_what_it_pressed_on(tmp_path: Path) -> None:
         assert link.force > 1.05
         _ = 1 / 0
     assert arm.at_rest == "the arm has retreated" and link.force == 0.0 and not link.alive
+
+
+def test_letting_go_of_an_arm_that_does_not_come_away_is_an_error(tmp_path: Path) -> None:
+    arm, link = pressing(tmp_path)
+    servo = arm._guard.servo
+    assert servo is not None
+    servo.ramp_to = Counted(0, RobotError("met 12 N")).around(servo.ramp_to, "ramp", link)
+    with pytest.raises(RobotError, match="holds its place, its way back not being free.*12 N"), arm:
+        pass
+    assert not link.alive
+
+
+def test_ctrl_c_while_the_retreat_is_written_is_not_lost(tmp_path: Path) -> None:
+    arm, _ = pressing(tmp_path)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    write = RawRecord.write
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+
+            def struck(*arguments: Any) -> Any:
+                signal.raise_signal(signal.SIGINT)
+                return write(*arguments)
+
+            patch.setattr(RawRecord, "write", struck)
+            with pytest.raises(KeyboardInterrupt):
+                arm.stop()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert arm.at_rest == "the arm has retreated" and (tmp_path / "retreat.parquet").is_file()
+
+
+def test_a_controller_that_went_away_between_two_moves_is_not_waited_for() -> None:
+    """Its client serves the last reading once more, and then commands would wait for minutes."""
+
+    class Gone(Link):
+        def __init__(self) -> None:
+            self.alive, self._left = True, 1
+
+        def next_sample(self) -> Any:
+            self._left -= 1
+            if self._left < 0:
+                self.alive = False
+                raise RobotError("no new reading")
+
+        @property
+        def _control(self) -> Any:
+            raise AssertionError("a command that waits")
+
+    link = Gone()
+    with pytest.raises(RobotError, match="no new reading"):
+        link.stop()
+    link.stop()
 
 
 @pytest.mark.parametrize("fails", ["on_row", "estimator", "policy"])

@@ -68,19 +68,21 @@ def run_exploration(
     task: Task | None = None,
     truth: KnownTruth | None = None,
     closing: Closing | None = None,
-    let_go: Callable[[], None] = lambda: None,
+    let_go: Callable[[], str | None] = lambda: None,
     show_progress: bool = True,
 ) -> tuple[Belief, Episode, str]:
     """Explore until it is enough, saving as it goes; returns belief, episode and why it ended.
 
     What an earlier run has `kept` in the folder stays, and `steps` come after it; where that is
     enough already, only what ends a run is missing. `let_go` is called once no more moves come,
-    before the closing draws, and before all else where something fails.
+    before the closing draws, and before all else where something fails; what it says is told.
     """
     kept = kept or Kept()
 
     def end(episode: Episode, reason: str) -> tuple[Belief, Episode, str]:
-        let_go()
+        left = let_go()
+        if left is not None:
+            run.bar.write(f"warning: {left}", file=sys.stderr)
         belief = run.finish(episode, truth)
         return belief, episode, stopping.closed_reason(reason, belief, task)
 

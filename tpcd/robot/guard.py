@@ -77,10 +77,8 @@ class Guard:
             return
         self.signals.hold()
         ended = self._leave()
-        try:
-            self.signals.release()
-        finally:
-            self._keep_retreat()
+        self._keep_retreat()
+        self.signals.release()
         if isinstance(ended, KeyboardInterrupt):
             raise ended
 

@@ -49,7 +49,7 @@ class HeldSignals:
 
     def hold(self) -> None:
         """From here on signals wait."""
-        if threading.current_thread() is not threading.main_thread():
+        if not _in_main_thread():
             return
         self._held = True
         for number in NUMBERS:
@@ -60,12 +60,14 @@ class HeldSignals:
 
     def look(self) -> None:
         """Call the handlers of what waits: for Ctrl-C this raises KeyboardInterrupt."""
-        while self._waiting:
+        while self._waiting and _in_main_thread():
             number, frame = self._waiting.popleft()
             self._handlers[number](number, frame)
 
     def release(self) -> None:
         """No signal waits any more; the handlers of what waited are called, and may raise."""
+        if not _in_main_thread():
+            return
         self._held = False
         try:
             self.look()
@@ -79,3 +81,7 @@ class HeldSignals:
             self._waiting.append((number, frame))
         else:
             self._handlers[number](number, frame)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()

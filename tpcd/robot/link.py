@@ -129,7 +129,10 @@ class Link:
             self._do(self._control.zeroFtSensor)
 
     def stop(self) -> None:
-        """End the servo; the arm holds where it is. Nothing where the link is lost."""
+        """End the servo; the arm holds where it is. Raises RobotError where the link is lost, which
+        may have been so since the last reading."""
+        for _ in range(2 * self.alive):  # The first may be one that was served before.
+            self.next_sample()
         if self.alive and self._ask(self._control.isProgramRunning):
             self._do(self._control.servoStop)
 

@@ -46,8 +46,8 @@ class Robot(Protocol):
         """Go on after the rows of an exploration that was stopped."""
         ...
 
-    def stop(self) -> None:
-        """Stop all motion at once."""
+    def stop(self) -> str | None:
+        """Stop all motion at once; how the robot was left where it may still touch something."""
         ...
 
     def doubts(self) -> tuple[Finding, ...]:
@@ -61,7 +61,7 @@ class Robot(Protocol):
 
 
 @contextmanager
-def stopped_first(stop: Callable[[], None]) -> Iterator[None]:
+def stopped_first(stop: Callable[[], object]) -> Iterator[None]:
     """A block whose failure stops the arm before anybody writes, draws or tells.
 
     The arm may press on something between two moves, so also what fails then ends in its retreat.

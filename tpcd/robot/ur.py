@@ -25,7 +25,7 @@ from tpcd.robot import preflight
 from tpcd.robot.arm_settings import ArmSettings
 from tpcd.robot.frames import TaskFrame, out_of_plane, planar_pose, task_frame
 from tpcd.robot.free_space import check_room, lifted
-from tpcd.robot.guard import Guard
+from tpcd.robot.guard import RETREATED, Guard
 from tpcd.robot.link import Link
 from tpcd.robot.protocol import Reading, stopped_first
 from tpcd.robot.raw import RawRecord
@@ -63,8 +63,13 @@ class UniversalRobot:
     def __enter__(self) -> UniversalRobot:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self.close()
+    def __exit__(self, kind: object, *error: object) -> None:
+        try:
+            left = self.stop()
+        finally:
+            self.close()
+        if left is not None and kind is None:
+            raise RobotError(left)
 
     def start(self) -> Episode:
         """Connect, ask, lift the arm, zero and check its sensor in free air and go back; the
@@ -100,6 +105,7 @@ class UniversalRobot:
 
         def back() -> Episode:
             servo.retreat()
+            assert servo.state is not None, "it has just moved"
             self._go_above(servo, first, float(servo.state.reference[1]))
             return self._zero_at(servo, first)
 
@@ -168,13 +174,20 @@ class UniversalRobot:
                         resumable=False,
                     )
 
-    def stop(self) -> None:
-        """Hold at once, and retreat where that is safe; nothing if it has been done.
+    def stop(self) -> str | None:
+        """Hold at once, and retreat where that is safe; nothing if it has been done. Returns how
+        the arm was left where it did not retreat, or where its readings were not kept.
 
         Ctrl-C ends the retreat, and is raised once the arm is at rest.
         """
-        if self._link is not None:
-            self._guard.stop()
+        if self._link is None:
+            return None
+        self._guard.stop()
+        return None if self.at_rest == RETREATED or not self._has_moved else self.at_rest
+
+    @property
+    def _has_moved(self) -> bool:
+        return self._guard.servo is not None and self._guard.servo.state is not None
 
     def doubts(self) -> tuple[Finding, ...]:
         """Whether the sensor's zero has drifted since the present episode began, as far as it was

@@ -35,6 +35,8 @@ DRIFT = 0.6
 FROZEN = 0.25
 """Of each channel of the wrench under the fault frozen_sensor [N, N·m]."""
 GRAVITY = 9.81
+SLOWEST = 1e-3
+"""Speed of a move whose client states none [m/s]."""
 LEVER = 0.2
 """A turn counts as the way of a point so far away [m]."""
 
@@ -174,7 +176,7 @@ class Controller:
         first = float(self._input.get("input_double_register_0", 0.0))
         if command == MOVE_L:
             if self._moving is None:
-                speed = float(self._input["input_double_register_6"])
+                speed = float(self._input.get("input_double_register_6", 0.0)) or SLOWEST
                 self._moving = self._planar_input(), speed
             elif np.allclose(self._actual, self._moving[0], atol=1e-9):
                 self._moving = None
@@ -215,9 +217,12 @@ class Controller:
     def _planar_input(self) -> Float[np.ndarray, " 3"]:
         """The target in the input registers, in the plane; from outside of it, a stop."""
         names = [f"input_double_register_{index}" for index in range(6)]
-        tcp = np.array([self._input[name] for name in names], dtype=float)
-        distance, lean = out_of_plane(self._frame, tcp)
-        if distance > 0.005 or lean > 0.05:
+        tcp = np.array([self._input.get(name, 0.0) for name in names], dtype=float)
+        in_plane = np.isfinite(tcp).all()
+        if in_plane:
+            distance, lean = out_of_plane(self._frame, tcp)
+            in_plane = distance <= 0.005 and lean <= 0.05
+        if not in_plane:
             self.protective_stop()
             return self._actual
         return planar_pose(self._frame, tcp)

@@ -10,6 +10,7 @@ import os
 import selectors
 import socket
 import struct
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -128,6 +129,16 @@ class Server:
         if self._controller.is_due("frozen_link"):
             return 0
         connection.received += data
+        try:
+            return self._understood(connection)
+        except (ValueError, LookupError, ArithmeticError, struct.error) as error:
+            told = f"closing a connection to port {connection.port} that sent what is no message"
+            print(f"warning: {told} ({error})", file=sys.stderr, flush=True)
+            self._drop(connection)
+            return 0
+
+    def _understood(self, connection: Connection) -> int:
+        """Take the whole messages of what was received; returns how many servo targets came."""
         if connection.port == RTDE:
             return self._handle_rtde(connection)
         if connection.port == DASHBOARD:
@@ -195,7 +206,11 @@ class Server:
             connection.output = recipe if "NOT_FOUND" not in recipe.types else None
         elif kind == protocol.SETUP_INPUTS:
             recipe = _recipe(len(connection.inputs) + 1, payload)
-            if self._settings.fault == "register_in_use":
+            others = (one for one in self._connections if one is not connection)
+            taken = {
+                name for one in others for other in one.inputs.values() for name in other.names
+            }
+            if self._settings.fault == "register_in_use" or taken.intersection(recipe.names):
                 types = ("IN_USE", *recipe.types[1:])
                 return b"\x00" + ",".join(types).encode()
             connection.inputs[recipe.number] = recipe

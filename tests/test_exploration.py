@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -172,8 +173,10 @@ ARGUMENTS = ("--outline", "soup_can", "--prior", PRIOR, "--truth", "quasistatic"
 
 
 def test_the_command_explores_stops_and_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    few = partial(EstimatorSettings, sampler=FAST, closing=CLOSING)
+    monkeypatch.setattr("tpcd.commands.exploring.EstimatorSettings", few)
     out = tmp_path / "run"
     assert call("explore", *ARGUMENTS, "--steps", "2", "--out", str(out)) == 0
     assert "all 2 moves are made" in capsys.readouterr().err

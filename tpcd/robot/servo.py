@@ -60,8 +60,8 @@ GENTLE = 2.5
 PROGRESS = 0.01
 """Share of the command's way whose time is limited, while the arm follows."""
 FROZEN = 0.1
-"""A channel of the wrench that repeats exactly for so long [s], and for longer than its own habit in
-free air allows, is of a sensor that has stopped, unless its readings are said to have no noise."""
+"""A channel of the wrench that repeats exactly for so long [s], and for longer than is its habit in
+free air, is of a sensor that has stopped, unless its readings are said to have no noise."""
 IN_AIR = 0.2
 """At the end of a retreat, over which the wrench in free air is read: `ARRIVING` less what a servo
 lags behind, three times over [s]."""

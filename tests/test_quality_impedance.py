@@ -15,7 +15,9 @@ from scipy.stats import binom
 from tpcd.logs.log import Log
 from tpcd.quality.blocks import block_edges, correlation_time, jackknife, moments
 from tpcd.quality.identify import identify
+from tpcd.quality.parity import fit_parity
 from tpcd.quality.quantity import LEVEL, Quantity, quantity, untold
+from tpcd.quality.springs import springs
 
 AXES = ("x", "y", "z")
 SIX = (*AXES, "rx", "ry", "rz")
@@ -77,6 +79,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say_in_contact_and_out_of_it(
     assert widest["weight"] < 0.1 * abs(arm.weight)
     assert widest["arm_friction_x"] < arm.friction[0]
     assert widest["pose_lag"] < 0.03 and widest["sensor_rotation_z"] < 0.03
+    assert widest["centre_of_mass_x"] < 0.007 and widest["torque_bias_z"] < 0.016
 
 
 def test_gain_is_told_with_a_stiffness_and_only_times_it_without() -> None:
@@ -106,7 +109,9 @@ def test_frames_are_not_told_by_an_arm_that_does_not_turn() -> None:
     assert not quantity(told, "wrench_frame").told
     assert "fit alike" in quantity(told, "wrench_frame").reason
     assert "turn the end effector" in quantity(told, "wrench_frame").motion
-    assert not quantity(told, "weight").told
+    # Contact tilts it by a degree, which shows the weight to half of itself at best.
+    weight = quantity(told, "weight")
+    assert not weight.told or (holds(weight, Arm().weight) and half_width(weight) > 3.0)
 
 
 def test_noise_on_both_sides_widens_the_stiffness_and_does_not_shift_it() -> None:
@@ -114,6 +119,17 @@ def test_noise_on_both_sides_widens_the_stiffness_and_does_not_shift_it() -> Non
     found = [quantity(identify(moving(arm, 4, SECONDS)), "stiffness_x") for arm in (calm, rough)]
     assert all(holds(each, calm.stiffness[0]) for each in found)
     assert half_width(found[1]) > 3 * half_width(found[0])
+
+
+def test_friction_of_an_arm_that_reverses_often_is_not_told_too_small() -> None:
+    arm, off = Arm(pose_lag=0.0, turn=0.1), []
+    for seed in range(4):
+        sampled = springs(moving(arm, 3000 + seed))
+        assert sampled is not None
+        for axis, true in zip(fit_parity(sampled, "tool", "world").told, arm.friction, strict=True):
+            off.append(np.mean([float(end.value) for end in axis.friction]) / true - 1.0)
+    # Each is known to about 0.05, their mean to 0.01.
+    assert len(off) == 24 and abs(np.mean(off)) < 0.05
 
 
 def test_a_turned_sensor_does_not_shift_the_stiffness() -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from tpcd.logs.log import AXES, Log
@@ -21,9 +21,9 @@ MOST = 20_000
 """Samples that are looked at; more are thinned out evenly."""
 OVER = 0.1
 """Speed is taken over so long [s]."""
-NOISY, SLOW = 4.0, 0.01
+NOISY, SLOW = 3.0, 0.002
 """An arm moves where its speed is so many standard deviations of noise, and so much of its largest
-speed."""
+speed. What slides slower counts as held, and friction beside damping is told by what is slow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +95,17 @@ class Springs:
         noise = np.median(np.abs(np.diff(single, axis=0)), axis=0) / 1.65
         least = NOISY * noise * 2**0.5 / (2 * span * self.step)
         least = np.maximum(np.maximum(least, SLOW * np.abs(speeds).max(0)), 1e-12)
-        return np.where(self._held(speeds, least), _latest(speeds, least), 0.0)
-
-    def _held(
-        self, speeds: Float[np.ndarray, "n 6"], least: Float[np.ndarray, " 6"]
-    ) -> Bool[np.ndarray, "n 6"]:
-        """Where a coordinate moves, or its command has rested since it did."""
-        order = np.arange(len(speeds))[:, None]
-        moved = np.maximum.accumulate(np.where(np.abs(speeds) > least, order, -1))
+        ways = np.where(np.abs(speeds) > least, np.sign(speeds), 0.0)
+        if not self.sparse:
+            # A reversal within the time that a speed is taken over is no motion yet.
+            near = span // 2
+            padded = np.pad(ways, ((near, near), (0, 0)), mode="edge")
+            ways = np.where((padded[:count] == ways) & (padded[2 * near :] == ways), ways, 0.0)
+        order = np.arange(count)[:, None]
+        moved = np.maximum.accumulate(np.where(ways != 0, order, -1))
         asked = np.maximum.accumulate(np.where(np.abs(self.asked) > least, order, -1))
-        return (moved >= 0) & ((moved == order) | (asked <= moved))
+        held = (moved >= 0) & ((moved == order) | (asked <= moved))
+        return np.where(held, np.take_along_axis(ways, np.maximum(moved, 0), axis=0), 0.0)
 
     @property
     def step(self) -> float:
@@ -150,12 +151,3 @@ def springs(log: Log) -> Springs | None:
     mask = np.zeros(len(log), dtype=bool)
     mask[kept[::every]] = True
     return Springs(log.only(mask), every)
-
-
-def _latest(
-    speeds: Float[np.ndarray, "n 6"], least: Float[np.ndarray, " 6"]
-) -> Float[np.ndarray, "n 6"]:
-    """Sign of the last motion that was faster than `least`."""
-    order = np.arange(len(speeds))[:, None]
-    moved = np.maximum.accumulate(np.where(np.abs(speeds) > least, order, -1))
-    return np.sign(np.take_along_axis(speeds, np.maximum(moved, 0), axis=0))

@@ -40,6 +40,25 @@ class Arm:
     """Typical rotation [rad]."""
 
 
+def truth(arm: Arm) -> dict[str, float]:
+    """What identification should find, by the names of its quantities; the centre of mass, point
+    and rotation in the sensor's axes, stiffness and friction times the gain."""
+    turn = Rotation.from_rotvec(arm.sensor_rotation)
+    vectors = {
+        "force_bias": arm.sign * np.array(arm.force_bias),
+        "torque_bias": arm.sign * np.array(arm.torque_bias),
+        "centre_of_mass": turn.apply(arm.centre),
+        "sensor_rotation": np.array(arm.sensor_rotation),
+        "sensor_point": turn.apply(arm.point),
+    }
+    found = {f"{kind}_{a}": float(v[k]) for kind, v in vectors.items() for k, a in enumerate("xyz")}
+    for k, axis in enumerate(("x", "y", "z", "rx", "ry", "rz")):
+        found[f"stiffness_{axis}"] = arm.gain * arm.stiffness[k]
+        found[f"arm_friction_{axis}"] = arm.gain * arm.friction[k]
+    weight = arm.sign * arm.gain * arm.weight
+    return {**found, "weight": weight, "pose_lag": arm.pose_lag, "wrench_lag": 0.0}
+
+
 def smooth(random, times, scale, columns):
     """Random functions of time with unit variance, that change over `scale` seconds."""
     step = times[1] - times[0]

@@ -6,9 +6,9 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from made_logs import SAMPLE_STD, Setting, an_episode, in_space, sampled
 from scipy.spatial.transform import Rotation
 
+from tests.made_logs import SAMPLE_STD, Setting, an_episode, in_space, sampled
 from tpcd.quality.finding import Finding, Weight
 from tpcd.quality.stream import Stream
 

@@ -105,9 +105,10 @@ def _from_parity(parity: Parity, stiffness: Sequence[float] | None) -> tuple[Qua
     found = parity.stiffness()
     known = found[0] != 0
     if stiffness is not None:
-        given = np.array(stiffness, dtype=float)
-        known = np.isfinite(given) | known
-        found = tuple(np.where(np.isfinite(given), parity.sign * given, each) for each in found)
+        # Times the gain, as the sensor reads it, is what the data tell.
+        given = parity.sign * np.nan_to_num(np.array(stiffness, dtype=float))
+        found = tuple(np.where(known, each, given) for each in found)
+        known = known | (given != 0)
     tables = []
     for each in found:
         seen = _beside_springs(parity, each, bool(known[3:].all()))

@@ -91,8 +91,8 @@ def _told(
     """Whether the first place is told, and how many alarms are at none of them."""
 
     def at(each: Finding, place: Any) -> bool:
-        own = each.channels == (name,) and each.rows is not None
-        return own and each.rows[0] < place[1] and place[0] < each.rows[1]
+        first, end = each.rows or (0, 0)
+        return each.channels == (name,) and first < place[1] and place[0] < end
 
     told = alarms(check_channels([stream]))
     found = any(each.kind == kind and at(each, places[0]) for each in told)

@@ -19,7 +19,7 @@ from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
-from tpcd.truth.recording import make_motion, record
+from tpcd.truth.recording import Policy, make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
 PRIOR, PARTICLES, LEARNT, TESTED = "ycb21-z2", 100, 6, 20
@@ -33,7 +33,7 @@ def fit_runs(seed: int) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(seed)
     own, other = (OBJECTS[(seed + k) % len(OBJECTS)] for k in (0, 1))
 
-    def recorded(name: str, motion: str, steps: int, fixed: dict[str, float]) -> Any:
+    def recorded(name: str, motion: Policy, steps: int, fixed: dict[str, float]) -> Any:
         scene = draw_scene(name, builtin_outlines()[name].vertices, generator, fixed=fixed)
         moves = make_motion(motion, scene, steps, generator)
         truth = make_truth(scene, "quasistatic")

@@ -31,9 +31,9 @@ from tpcd.quality.springs import Springs
 WIDE = np.radians(10.0)
 """An end effector that turned less shows nothing of which axes a wrench is in [rad]."""
 
-STRAIGHT = 0.005
-"""Part of a stiffness that no interval is narrower than, either way: friction that sticks and
-commands that move while a pose lags are not the straight lines that are fitted (0.3 % in made
+STRAIGHT = 0.003
+"""Part of a stiffness by which intervals are wider, either way: friction that sticks and commands
+that move while a pose lags are not the straight lines that are fitted (0.1 to 0.3 % in made
 recordings of arms that do both)."""
 OWN = 6
 """Columns w, e, 1, direction, rates of e and u come first; what the axes share comes after."""
@@ -66,11 +66,10 @@ class Axis:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Of the stiffness, never narrower than `STRAIGHT`."""
+        """Of the stiffness."""
         ends = (*self.low.bounds(), *self.high.bounds())
         margin = STRAIGHT * abs(self.stiffness)
-        low, high = float(min(ends)), float(max(ends))
-        return min(low, self.stiffness - margin), max(high, self.stiffness + margin)
+        return float(min(ends)) - margin, float(max(ends)) + margin
 
     @property
     def stiffness(self) -> float:

@@ -72,7 +72,7 @@ def channel_runs(seed: int) -> list[dict[str, Any]]:
             limit = float(np.quantile(column, 1 - part))
             values = stream.values.copy()
             values[:, stream.channels.index("F_x")] = np.minimum(column, limit)
-            cut = np.flatnonzero(np.diff(np.pad(column > limit, 1).astype(int))).reshape(-1, 2)
+            cut = np.flatnonzero(np.diff(np.pad(column >= limit, 1).astype(int))).reshape(-1, 2)
             longest = cut[np.argmax(cut[:, 1] - cut[:, 0])]
             clipped, what = replace(stream, values=values), f"{part:.0%} clipped, longest stretch"
             rows.append(_told(case, what, clipped, "clipped", "F_x", [longest, *cut]))

@@ -29,6 +29,23 @@ FAULTS = {
     "no file": (None, "no such file"),
     "a folder": ("", "cannot be read"),
     "no YAML": ("effects: [", "not valid YAML"),
+    "a key twice": ("effects: []\neffects: [{name: floor_tilt}]", "key effects appears twice"),
+    "found twice": (
+        "effects: [{name: floor_tilt, found: {angle: [0.1, 0.1], angle: [0.2, 0.1]}}]",
+        "key angle appears twice",
+    ),
+    "prior in mm/N": (
+        "effects: [{name: floor_compliance, parameters: {compliance: [0.1, 0.4]}}]",
+        "prior of floor_compliance.compliance is [0.1, 0.4], expected m/N, within 10 times",
+    ),
+    "found in mm/N": (
+        "effects: [{name: floor_compliance, found: {compliance: [0.21, 0.02]}}]",
+        "found of floor_compliance.compliance is 0.21, expected m/N, within 10 times",
+    ),
+    "prior of the other sign": (
+        "effects: [{name: floor_compliance, parameters: {compliance: [-1.0e-4, 1.0e-4]}}]",
+        "starts at -0.0001, expected at least 0",
+    ),
     "a list": ("- floor_tilt", "is not a mapping"),
     "another key": ("effect: []", "has 'effect'"),
     "no list": ("effects: floor_tilt", "expected a list"),

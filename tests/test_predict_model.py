@@ -99,6 +99,17 @@ def test_draws_are_those_that_were_found(learnt) -> None:
     assert float(drawn.mean()) == pytest.approx(low + 2e-5 * (2 / torch.pi) ** 0.5, rel=0.03)
 
 
+@pytest.mark.parametrize("times", [-100.0, 100.0])
+def test_what_was_found_far_beyond_an_end_of_the_prior_is_drawn_from_that_end(
+    learnt, times: float
+) -> None:
+    belief, _ = learnt
+    (parameter,) = SOFT.parameters
+    width, end = parameter.high - parameter.low, parameter.high if times > 0 else parameter.low
+    drawn = with_model(belief, soft(end + times * 1e-3 * width, 1e-3 * width), torch.Generator())
+    assert float((drawn.vectors[:, -1] - end).abs().max()) < 0.01 * width
+
+
 @pytest.mark.parametrize("mean", [2e-4, -1.0, 1.0])
 def test_values_known_for_certain_are_taken_within_the_prior(learnt, mean: float) -> None:
     belief, _ = learnt

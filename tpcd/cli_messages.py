@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from tpcd.errors import FileError
-from tpcd.plain_yaml import read_yaml
 
 KINDS = {"int": "a whole number", "float": "a finite number", "bool": "true or false",
          "str": "text, in quotes where it looks like a number"}  # fmt: skip
@@ -75,12 +74,12 @@ def file_of(error: OSError) -> str | None:
 
 def check_config_files(paths: Sequence[str]) -> None:
     """Refuse a configuration that is missing or no mapping of settings, by `FileError`."""
+    from tpcd.records import read_entries
+
     for name in paths:
-        path, remedy = Path(name), "give a YAML file of settings such as config.yaml of a run"
-        content = read_yaml(path, FileError, remedy)
-        if not isinstance(content, dict):
-            found = "nothing" if content is None else f"a {type(content).__name__}"
-            raise FileError(path, f"holds {found}, expected settings by name", remedy)
+        read_entries(
+            Path(name), "give a YAML file of settings such as config.yaml of a run", FileError
+        )
 
 
 def _wrong_value(problem: str) -> str:

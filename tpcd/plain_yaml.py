@@ -73,7 +73,7 @@ def read_yaml(path: Path, error: type[FileError] = FileError, remedy: str = "") 
         raise error(path, "not a UTF-8 text file", "save it in UTF-8") from cause
     except RepeatedKeyError as cause:
         raise error(path, f"key {cause} appears twice", "remove one of them") from cause
-    except yaml.YAMLError as cause:
+    except (yaml.YAMLError, ValueError, RecursionError) as cause:
         mark = getattr(cause, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         raise error(path, f"not valid YAML{where}", "correct it by hand") from cause

@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,15 +20,16 @@ from typing import Any, NoReturn
 
 from tpcd.cli_messages import REMEDIES, file_of
 from tpcd.errors import RunError
-from tpcd.files import read_json, to_plain, write_json, write_text
+from tpcd.files import to_plain, write_json, write_text
 from tpcd.ownership import check_none_within, is_lock, owned
-from tpcd.plain_yaml import read_yaml, to_yaml
+from tpcd.plain_yaml import to_yaml
 from tpcd.targets import ELSEWHERE, check_place
-from tpcd.versions import versions
+from tpcd.versions import differing_parts, versions
 
 CONFIG_FILE = "config.yaml"
 VERSIONS_FILE = "versions.json"
 RESULTS_FILE = "results.json"
+RESTORE = "restore it, or begin anew in a new folder"
 STORAGE = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -103,7 +105,7 @@ def resumed_run(
     folder = Path(path)
     if not (folder / CONFIG_FILE).is_file():
         raise RunError(folder, "holds no run to go on with", "leave out --resume")
-    with owned(path, _command(folder)):
+    with owned(path, str(_recorded(folder)["command"])):
         _continue(folder, config, free)
         shutil.rmtree(_earlier(folder.resolve()), ignore_errors=True)
         try:
@@ -207,11 +209,13 @@ def _start(folder: Path, command: str, config: Mapping[str, Any] | Any) -> None:
 
 
 def _continue(folder: Path, config: Mapping[str, Any] | Any, free: Sequence[str]) -> None:
-    """Refuse to go on with another configuration, and keep the new values."""
-    before = read_yaml(folder / CONFIG_FILE, RunError)
-    before, now = _kept(before), _kept(config)
-    recorded = read_json(folder / VERSIONS_FILE) if (folder / VERSIONS_FILE).is_file() else {}
-    began_in = Path(recorded.get("folder", ""))
+    """Refuse to go on with another configuration, and keep the new values; versions that have
+    changed since are told, and kept beside those before."""
+    from tpcd.records import fitting
+
+    before, now = _kept(_configuration(folder)), _kept(config)
+    recorded, here = _recorded(folder), versions()
+    began_in = Path(str(recorded.get("folder", "")))
     changed = [key for key in now if now[key] != before.get(key)]
     differing = [key for key in changed if not _same(before.get(key), now[key], began_in)]
     differing = [key for key in differing if key not in free]
@@ -219,9 +223,18 @@ def _continue(folder: Path, config: Mapping[str, Any] | Any, free: Sequence[str]
         raise RunError(
             folder, f"holds a run whose {_listed(differing)} not the same", "name a new folder"
         )
+    with fitting(folder / VERSIONS_FILE, RESTORE):
+        since = list(recorded.get("gone_on_with", []))
+        other = differing_parts((since or [recorded])[-1], here)
+    if other:
+        told = f"note: {folder} goes on with other versions than before ({', '.join(other)})"
+        print(f"{told}; both are in its {VERSIONS_FILE}", file=sys.stderr)
+        recorded["gone_on_with"] = [*since, here]
     if changed:
         write_text(folder / CONFIG_FILE, to_yaml(now))
-        write_json(folder / VERSIONS_FILE, recorded | {"folder": os.getcwd()})
+        recorded["folder"] = os.getcwd()
+    if changed or other:
+        write_json(folder / VERSIONS_FILE, recorded)
 
 
 def _same(before: Any, now: Any, began_in: Path) -> bool:
@@ -235,10 +248,21 @@ def _same(before: Any, now: Any, began_in: Path) -> bool:
     return before == now
 
 
-def _command(folder: Path) -> str:
-    """What a run was begun by; it goes on with the same."""
-    recorded = folder / VERSIONS_FILE
-    return read_json(recorded)["command"] if recorded.is_file() else "another process"
+def _configuration(folder: Path) -> dict[str, Any]:
+    """What a run was begun with, or gone on with since; raises `FileError`."""
+    from tpcd.records import read_entries
+
+    return read_entries(folder / CONFIG_FILE, RESTORE)
+
+
+def _recorded(folder: Path) -> dict[str, Any]:
+    """What a run was begun by; raises `FileError`."""
+    from tpcd.records import read_entries
+
+    recorded = read_entries(folder / VERSIONS_FILE, RESTORE)
+    if "command" not in recorded:
+        raise RunError(folder / VERSIONS_FILE, "has no entry command", RESTORE)
+    return recorded
 
 
 def _kept(config: Mapping[str, Any] | Any) -> dict[str, Any]:
@@ -267,13 +291,13 @@ def write_results(
     folder = Path(folder)
     if not (folder / CONFIG_FILE).is_file() or not (folder / VERSIONS_FILE).is_file():
         raise RunError(folder, "is not an opened run", "make it with run_folder first")
-    recorded = read_json(folder / VERSIONS_FILE)
+    recorded = _recorded(folder)
     content = {
         "command": recorded.pop("command"),
         "table": list(table),
         **extra,
         "seeds": list(seeds),
-        "config": read_yaml(folder / CONFIG_FILE, RunError),
+        "config": _configuration(folder),
         "versions": recorded,
     }
     return write_json(folder / RESULTS_FILE, content)

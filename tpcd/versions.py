@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -50,6 +51,25 @@ def versions() -> dict[str, Any]:
             ),
         },
     }
+
+
+def differing_parts(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Code and packages of which two `versions` tell different ones, in words."""
+    found = []
+    for name, old, new in (
+        ("tpcd", before.get("tpcd"), now["tpcd"]),
+        ("revision", _revision(before), _revision(now)),
+        ("python", before.get("python"), now["python"]),
+        *((name, (before.get("packages") or {}).get(name), new)
+          for name, new in now["packages"].items()),
+    ):  # fmt: skip
+        if old != new:
+            found.append(f"{name} {old or 'unknown'}, now {new or 'none'}")
+    return found
+
+
+def _revision(recorded: Mapping[str, Any]) -> str | None:
+    return ((recorded.get("git") or {}).get("revision") or "")[:10] or None
 
 
 def _git_state() -> dict[str, Any] | None:

@@ -84,6 +84,7 @@ def _draw(
         low, high = parameter.low, parameter.high
         if parameter.name in found:
             mean, std = found[parameter.name]
+            mean = min(max(mean, low), high)
             # A normal distribution cut off at the ends of the prior, by inversion.
             ends = torch.tensor([low - mean, high - mean], dtype=torch.float64)
             ends = torch.special.ndtr(ends / std) if std > 0 else (ends > 0).double()

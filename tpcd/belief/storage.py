@@ -21,7 +21,8 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.effects.model import effects_from_plain, effects_to_plain
 from tpcd.errors import RunError
-from tpcd.files import read_json, write_bytes, write_json
+from tpcd.files import write_bytes, write_json
+from tpcd.records import fitting, read_entries
 from tpcd.shape.checkpoint import load_prior, prior_record, recorded_prior
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
@@ -65,16 +66,15 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
     path = Path(folder) / "belief.json"
     if not path.is_file():
         raise RunError(path, "no such file", "give the folder that estimate wrote")
-    card = read_json(path)
-    found = card if isinstance(card, dict) else {}
-    if found.get("format") != "tpcd-belief" or found.get("format_version") != FORMAT_VERSION:
-        text = f"{found.get('format')} version {found.get('format_version')}"
+    card = read_entries(path, "estimate again")
+    if card.get("format") != "tpcd-belief" or card.get("format_version") != FORMAT_VERSION:
+        text = f"{card.get('format')} version {card.get('format_version')}"
         raise RunError(
             path,
             f"holds {text}, expected tpcd-belief version {FORMAT_VERSION}",
             "estimate again from the episode, or use the tpcd that wrote it",
         )
-    try:
+    with fitting(path, "estimate again"):
         place = None if shape is not None else recorded_prior(card, Path(folder))
         misfit, step = MisfitField(**card["misfit"]), StepSettings(**card["step"])
         effects = effects_from_plain(card.get("effects", []), path)
@@ -83,8 +83,6 @@ def load_belief(folder: str | Path, shape: Shape | None = None) -> Belief:
             name: math.nan if card[name] is None else float(card[name])
             for name in ("log_evidence", "log_evidence_std")
         }
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunError(path, f"cannot be read ({error!r})", "estimate again") from error
     if shape is None:
         assert place is not None
         shape = load_prior(place)

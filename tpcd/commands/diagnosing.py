@@ -25,7 +25,8 @@ from tpcd.effects.model import Model, write_model
 from tpcd.effects.shape_change import UNCHANGED, ShapeChange
 from tpcd.errors import RunError
 from tpcd.figures.sinks import save_figure
-from tpcd.files import read_json, write_json, write_text
+from tpcd.files import write_json, write_text
+from tpcd.records import fitting, read_entries
 from tpcd.results import RESULTS_FILE, resumed_run, run_folder
 from tpcd.versions import versions
 
@@ -101,8 +102,8 @@ def compare_runs(folders: Sequence[Path]) -> list[dict[str, Any]]:
         path = folder / "verdict.json"
         if not path.is_file():
             raise RunError(path, "no such file", "give folders that diagnose wrote")
-        found = read_json(path)
-        try:
+        found = read_entries(path, "diagnose again")
+        with fitting(path, "diagnose again"):
             effects = [size for effect in found["effects"] for size in _sizes(effect)]
             share = found["share_closed"]
             rows.append(
@@ -116,8 +117,6 @@ def compare_runs(folders: Sequence[Path]) -> list[dict[str, Any]]:
                     ),
                 }
             )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise RunError(path, f"cannot be read ({error!r})", "diagnose again") from error
     return rows
 
 

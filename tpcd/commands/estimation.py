@@ -21,15 +21,17 @@ from tqdm import tqdm
 
 from tpcd.belief.belief import Belief, EstimationStep
 from tpcd.belief.settings import CLOSING_SHARE_WITHOUT_LOOPS
-from tpcd.belief.state import EstimatorState, save_state
+from tpcd.belief.state import STATE_FILE, EstimatorState, save_state
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
 from tpcd.commands.fit import fit_line, learnt_fit, unknown_warning
 from tpcd.commands.summary import prior_summary, summarise
 from tpcd.commands.unexplained import unexplained_rows, unexplained_warning
 from tpcd.data.episode import Episode
+from tpcd.errors import RunError
 from tpcd.exploration import Closing
 from tpcd.files import named, write_json, write_text
+from tpcd.records import fitting
 from tpcd.simulator.native import available
 
 STEPS_FILE, SUMMARY_FILE = "steps.jsonl", "summary.json"
@@ -202,8 +204,16 @@ def few_draws_warning(row: dict[str, Any]) -> str | None:
 def _earlier_rows(path: Path, done: int) -> list[dict[str, Any]]:
     """The first rows of the file; later ones, of a step that was not finished, are dropped, and
     so is how the run ended then."""
-    lines = path.read_text(encoding="utf-8").splitlines()[:done] if done else []
-    rows = [json.loads(line) for line in lines]
+    remedy = "restore it, or estimate again"
+    if done and not path.is_file():
+        raise RunError(path, "no such file", remedy)
+    with fitting(path, remedy):
+        lines = path.read_text(encoding="utf-8").splitlines()[:done] if done else []
+        rows = [dict(json.loads(line)) for line in lines]
+        steps = [row["step"] for row in rows]
+    if steps != list(range(1, done + 1)):
+        told = f"holds other steps than the {done} that {STATE_FILE} has learnt from"
+        raise RunError(path, told, remedy)
     for row in rows:
         row.pop("closed", None)
     _write_rows(path, rows)

@@ -3,9 +3,10 @@ a run that is asked about it can be trusted."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,9 +23,10 @@ from tpcd.data.episode import Episode
 from tpcd.data.table import row_name
 from tpcd.effects.shape_change import ShapeChange
 from tpcd.errors import EpisodeError
-from tpcd.files import read_json, write_json
+from tpcd.files import write_json
 from tpcd.parameters import Parameters
 from tpcd.planar import wrap_angle
+from tpcd.records import fitting, read_entries
 from tpcd.results import RESULTS_FILE
 from tpcd.shape.protocol import Shape
 
@@ -130,19 +132,12 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
     found = []
     if (run / STEPS_FILE).is_file() and not (run / RESULTS_FILE).is_file():
         found.append(f"{run} was stopped before it was done; its belief is of the rows so far")
-    if (run / DOUBTS_FILE).is_file():
-        doubts = read_json(run / DOUBTS_FILE)["episode_doubts"]
-        found.append(f"{run} was learnt from an episode with doubts: {doubts}")
-    if (run / RESULTS_FILE).is_file():
-        contradicted = read_json(run / RESULTS_FILE).get("contradicted")
-        found += [f"{run} was learnt from {contradicted}"] if contradicted else []
-    if (run / SUMMARY_FILE).is_file():
-        summary = read_json(run / SUMMARY_FILE)
-        unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))
-        told = unexplained_warning(unexplained, rows) if unexplained else None
-        found += [f"{run}: of what it was learnt from, {told}"] if told else []
-        unknown = unknown_warning(summary["fit"]) if "fit" in summary else None
-        found += [f"{run}: {unknown}"] if unknown else []
+    for name, told_by in _TOLD_BY.items():
+        if (run / name).is_file():
+            remedy = "restore it, or estimate again"
+            entries = read_entries(run / name, remedy)
+            with fitting(run / name, remedy):
+                found += [f"{run}{told}" for told in told_by(entries) if told]
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "
         told = doubts_told(episode.doubts, episode.path)
@@ -150,6 +145,31 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
         found += [f"{name}{each}" for each in map(str, episode_findings(episode))
                   if each != NO_CONTACT]  # fmt: skip
     return found
+
+
+def _told_by_doubts(doubts: Mapping[str, Any]) -> list[str]:
+    return [f" was learnt from an episode with doubts: {doubts['episode_doubts']}"]
+
+
+def _told_by_results(results: Mapping[str, Any]) -> list[str]:
+    contradicted = results.get("contradicted")
+    return [f" was learnt from {contradicted}"] if contradicted else []
+
+
+def _told_by_summary(summary: Mapping[str, Any]) -> list[str]:
+    unexplained, rows = (summary.get(key) for key in ("unexplained_rows", "rows"))
+    told = unexplained_warning(unexplained, rows) if unexplained and rows else None
+    unknown = unknown_warning(summary["fit"]) if "fit" in summary else None
+    found = [f": of what it was learnt from, {told}"] if told else []
+    return found + ([f": {unknown}"] if unknown else [])
+
+
+_TOLD_BY = {
+    DOUBTS_FILE: _told_by_doubts,
+    RESULTS_FILE: _told_by_results,
+    SUMMARY_FILE: _told_by_summary,
+}
+"""What the files of a run tell against it, each by its entries."""
 
 
 def _refuse_inside(

@@ -45,6 +45,8 @@ Found = Mapping[str, Mapping[str, tuple[float, float]]]
 """Mean and standard deviation [SI units] that data gave parameters of effects, by both names."""
 REACH = 4.0
 """Standard deviations about what was found that a prior keeps."""
+MOST = 10.0
+"""Sizes beyond so many times those of an effect's own range are in another unit."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +184,25 @@ def _with_priors(effect: Effect, given: Any) -> Effect:
             raise ValueError(
                 f"prior of {effect.name}.{parameter.name} is {ends!r}, expected [low, high]"
             ) from None
+        what = f"prior of {effect.name}.{parameter.name}"
+        _check_unit(parameter, f"{what} is [{low:g}, {high:g}]", low, high)
+        if parameter.low == parameter.null and low < parameter.low:
+            raise ValueError(f"{what} starts at {low:g}, expected at least {parameter.low:g}")
         parameters.append(replace(parameter, low=low, high=high))
     return replace(effect, parameters=tuple(parameters))  # type: ignore[type-var]
+
+
+def _check_unit(parameter: EffectParameter, told: str, *values: float) -> None:
+    """Refuse sizes [SI units] that are so far beyond the effect's own range that they are in
+    another unit; places follow the recording. Raises ValueError."""
+    if parameter.where:
+        return
+    own = max(abs(parameter.low - parameter.null), abs(parameter.high - parameter.null))
+    if any(MOST * own < abs(value - parameter.null) < math.inf for value in values):
+        raise ValueError(
+            f"{told}, expected {parameter.unit}, within {MOST:g} times [{parameter.low:g},"
+            f" {parameter.high:g}]"
+        )
 
 
 def _narrowed(
@@ -223,5 +242,10 @@ def _found_of(plain: Any, effects: Sequence[Effect], path: Path) -> Found:
                 raise ModelError(
                     path, f"found of {effect.name}.{name} is {pair!r}", "expected [mean, sd >= 0]"
                 )
+            parameter = effect.parameters[names.index(name)]
+            try:
+                _check_unit(parameter, f"found of {effect.name}.{name} is {mean:g}", mean)
+            except ValueError as error:
+                raise ModelError(path, str(error)) from error
             known[effect.name][name] = (mean, std)
     return known

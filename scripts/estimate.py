@@ -78,7 +78,7 @@ def estimate_episode(config: Estimate) -> None:
     shape = load_prior(config.prior)
     check_units(episode)
     check_start_pose(episode, shape, model.shape)
-    for warning in check_episode(episode):
+    for warning in check_episode(episode, effects=bool(model.effects)):
         print(f"warning: {warning}", file=sys.stderr)
     if config.resume:
         check_kept_model(model, config.out)

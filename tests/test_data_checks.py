@@ -22,12 +22,13 @@ def test_an_inverted_wrench_is_a_warning_and_a_right_one_is_none(tmp_path):
     poses[1:, 1] = 0.01
     stiffness = torch.tensor([100.0, 100.0, 50.0], dtype=torch.float64)
     noise = 0.05 * torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    poses += 1e-4 * torch.randn(8, 3, generator=generator, dtype=torch.float64)
     episode = Episode(
         commands=commands,
         poses=poses,
         wrenches=stiffness * (poses - commands) + noise,
         stiffness=stiffness,
-        sensor_std=torch.tensor([1e-4, 1e-4, 5e-4, 0.05, 0.05, 0.05], dtype=torch.float64),
+        sensor_std=torch.tensor([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05], dtype=torch.float64),
     )
     assert check_episode(episode) == []
     check_units(episode)

@@ -12,10 +12,8 @@ from tpcd.commands.checked import Checked
 from tpcd.data.checks import episode_findings
 from tpcd.data.episode import COLUMNS, Episode
 from tpcd.data.files import read_episode
-from tpcd.data.noise import check_noise
-from tpcd.errors import EpisodeError
+from tpcd.data.noise import noise_findings
 from tpcd.logs.columns import log_from_columns
-from tpcd.quality.finding import Finding, Weight
 from tpcd.quality.identify import identify
 from tpcd.quality.stream import Stream
 
@@ -23,11 +21,7 @@ from tpcd.quality.stream import Stream
 def check_rows_of(path: Path) -> Checked:
     """Read and check an episode; raises `EpisodeError` for one that breaks the format."""
     episode = read_episode(path)
-    findings = [*episode.doubts, *episode_findings(episode)]
-    try:
-        findings += [Finding("row", Weight.DOUBT, line) for line in check_noise(episode)]
-    except EpisodeError as error:
-        findings.append(Finding("row", Weight.DOUBT, error.problem, remedy=error.remedy))
+    findings = [*episode.doubts, *episode_findings(episode), *noise_findings(episode)]
     stream = _rows_stream(episode)
     table = dict(zip(stream.channels, stream.values.T, strict=True)) | {"time": stream.times}
     log = log_from_columns(

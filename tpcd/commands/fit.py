@@ -123,6 +123,6 @@ def unknown_warning(found: Mapping[str, Any]) -> str | None:
     return (
         f"the prior does not know this object: its outline differs from every shape of the prior by"
         f" {found['misfit_mm']:.2g} mm, where up to {found['misfit_usual_mm']:.2g} mm are usual;"
-        f" {fit_line(found)}. Outline and intervals are not to be trusted: train a prior with such"
-        " objects, or give the object's own outline"
+        f" {fit_line(found)}. Outline and intervals are not to be trusted: check that frame, signs"
+        " and priors are right, then train a prior with such objects"
     )

@@ -20,6 +20,7 @@ from tpcd.contact import scene_from_parameters, terrain_gaps
 from tpcd.data.checks import NO_CONTACT, episode_findings
 from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
+from tpcd.data.noise import noise_findings
 from tpcd.data.table import row_name
 from tpcd.effects.shape_change import ShapeChange
 from tpcd.errors import EpisodeError
@@ -142,8 +143,8 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
         name = "" if episode.path is None else f"{episode.path.name}: "
         told = doubts_told(episode.doubts, episode.path)
         found += [told] if told else []
-        found += [f"{name}{each}" for each in map(str, episode_findings(episode))
-                  if each != NO_CONTACT]  # fmt: skip
+        odd = [*episode_findings(episode), *noise_findings(episode)]
+        found += [f"{name}{each}" for each in map(str, odd) if each != NO_CONTACT]
     return found
 
 

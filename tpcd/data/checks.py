@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tpcd.data.doubts import doubts_told
+from tpcd.data.equilibrium import Rows, departure, misplaced
 from tpcd.data.header import SENSOR_NAMES
 from tpcd.data.limits import (
     COMMAND_COLUMNS,
@@ -22,6 +23,7 @@ from tpcd.data.limits import (
     check_columns,
     check_jumps,
 )
+from tpcd.data.noise import noise_findings
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 from tpcd.quality.episode_rows import check_repeats
@@ -93,7 +95,13 @@ def check_rows(
     """
     check_columns(path, commands, poses, wrenches, unusual)
     check_jumps(path, commands, poses, wrenches, stiffness)
-    _check_start(path, commands[0], poses[0], wrenches[0], sensor_std)
+    try:
+        _check_start(path, commands[0], poses[0], wrenches[0], sensor_std)
+    except EpisodeError:
+        told = misplaced((commands, poses, wrenches), stiffness, sensor_std)
+        if told is not None:
+            raise EpisodeError(path, *told) from None
+        raise
 
 
 def _check_start(
@@ -127,13 +135,19 @@ def _check_start(
         )
 
 
-def check_episode(episode: Episode) -> list[str]:
+def check_episode(episode: Episode, effects: bool = False) -> list[str]:
     """Sentences on what is suspicious in an episode that obeys the format; often none.
 
-    What it was accepted in spite of comes first, in one line.
+    What it was accepted in spite of comes first, in one line. A wrench that is not K (pose -
+    command) is told once, and unless a model has `effects` that may explain it.
     """
     told = doubts_told(episode.doubts, episode.path)
-    return [*([told] if told else []), *(str(each) for each in episode_findings(episode))]
+    found = [*episode_findings(episode), *noise_findings(episode)]
+    departs = None
+    if not effects and not any(each.kind in ("unit", "inverted", "wrench") for each in found):
+        departs = departure(_rows(episode), episode.stiffness.numpy(), episode.sensor_std.numpy())
+    lines = [str(each) for each in found] + (["; ".join(departs)] if departs else [])
+    return [*([told] if told else []), *lines]
 
 
 def episode_findings(episode: Episode) -> list[Finding]:
@@ -145,12 +159,14 @@ def episode_findings(episode: Episode) -> list[Finding]:
     found = []
     noise, largest_wrench = episode.sensor_std.numpy(), np.abs(episode.wrenches.numpy()).max(0)
     significant, felt = _beyond_noise(episode)
-    unit = _unit_of_forces(episode)
+    unit, order = _unit_of_forces(episode), _wrong_order(episode)
     if unit is not None:
         found.append(_serious("unit", *unit))
+    elif order is not None:
+        found.append(_serious("wrench", *order))
     slopes = wrench_slopes(episode)
     for axis, (name, slope) in enumerate(slopes.items()):
-        if unit is not None and name != "tau":
+        if order is not None or (unit is not None and name != "tau"):
             continue
         if slope is None:
             if felt[:, axis].sum() >= LEAST_FELT:
@@ -163,10 +179,8 @@ def episode_findings(episode: Episode) -> list[Finding]:
         if name == "tau" and slope < INVERTED and _right_forces(slopes):
             found.append(_serious("inverted", *turned_told(episode, slope)))
         elif slope < INVERTED:
-            found.append(
-                _serious("inverted", inverted_sentence(name, slope), inverted_remedy(name))
-            )
-        elif name == "tau" and _as_in_degrees(slope):
+            found.append(_serious("inverted", *inverted_told(episode, name, slope)))
+        elif name == "tau" and _as_in_degrees(episode, slope):
             found.append(_serious("unit", *degrees_told(slope)))
         elif not 0.5 < slope < 2.0:
             told = (
@@ -209,21 +223,21 @@ def check_units(episode: Episode) -> None:
     check_scale(episode)
     for name, ratios in wrench_ratios(episode).items():
         if name == "tau":
-            if all(map(_as_in_degrees, ratios)):
+            if all(_as_in_degrees(episode, ratio) for ratio in ratios):
                 raise EpisodeError(where, *degrees_told(ratios[0]))
         elif all(ratio < INVERTED for ratio in ratios):
-            raise EpisodeError(where, inverted_sentence(name, ratios[0]), inverted_remedy(name))
+            raise EpisodeError(where, *inverted_told(episode, name, ratios[0]))
         elif min(map(abs, ratios)) > ANOTHER_ORDER or ANOTHER_ORDER * max(map(abs, ratios)) < 1:
             told = f"{name} is {ratios[0]:.2g} times K (pose - command), expected about 1"
             raise EpisodeError(where, told, "check the stiffness and the units")
 
 
 def check_scale(episode: Episode) -> None:
-    """Refuse an episode whose forces are K (pose - command) but for a factor of 1000; raises
-    `EpisodeError` with the unit that makes it."""
-    unit = _unit_of_forces(episode)
-    if unit is not None:
-        raise EpisodeError(episode.path or "episode", *unit)
+    """Refuse an episode whose wrench is K (pose - command) but for a factor of 1000, or for rows or
+    columns in another order; raises `EpisodeError` with what makes it so."""
+    told = _unit_of_forces(episode) or _wrong_order(episode)
+    if told is not None:
+        raise EpisodeError(episode.path or "episode", *told)
 
 
 def wrench_ratios(episode: Episode) -> dict[str, tuple[float, ...]]:
@@ -301,8 +315,14 @@ def turned_told(episode: Episode, slope: float) -> tuple[str, str]:
     )
 
 
-def _as_in_degrees(ratio: float) -> bool:
-    return 0.5 < math.degrees(ratio) < 2.0
+def _as_in_degrees(episode: Episode, ratio: float) -> bool:
+    """Whether the torque is about so many times K (phi - u_phi), and with angles in degrees all but
+    noise."""
+    significant, _ = _beyond_noise(episode)
+    rows = significant[:, 2]
+    there, here = episode.wrenches.numpy()[rows, 2], _expected_wrenches(episode)[rows, 2]
+    left = np.linalg.norm(there - math.radians(1.0) * here)
+    return 0.5 < math.degrees(ratio) < 2.0 and bool(left < UNIT_LEFT * np.linalg.norm(there))
 
 
 def wrench_slopes(episode: Episode) -> dict[str, float | None]:
@@ -324,17 +344,34 @@ def degrees_told(ratio: float) -> tuple[str, str]:
     return told, "expected rad: multiply u_phi, phi and its sensor_std by pi / 180"
 
 
-def inverted_remedy(name: str) -> str:
-    """What to do with a channel that looks inverted."""
-    return f"change the sign of the column {name}, or of its frame"
-
-
-def inverted_sentence(name: str, slope: float) -> str:
-    """What is said of a channel that looks inverted."""
-    return (
-        f"{name} looks inverted: it is {slope:.2f} times K (pose - command); expected is"
-        " what the world exerts on the object, so pressing on the floor gives F_z > 0"
+def inverted_told(episode: Episode, name: str, slope: float) -> tuple[str, str]:
+    """What is said of a force that looks inverted, and what to do: contact holds poses back, so
+    where they move farther than their commands, the two are swapped."""
+    axis = WRENCH_COLUMNS.index(name)
+    told = f"it is {slope:.2f} times K (pose - command)"
+    asked, moved = (
+        float(values[:, axis].diff().abs().sum()) for values in (episode.commands, episode.poses)
     )
+    if moved > asked + NOISE_FACTOR * len(episode) ** 0.5 * float(episode.sensor_std[axis]):
+        u, x = COMMAND_COLUMNS[axis], POSE_COLUMNS[axis]
+        return (
+            f"{u} and {x} look swapped, or {name} inverted: {told}, and {x} moves by {moved:.2g} m"
+            f" in all, farther than {u} with {asked:.2g} m, though contact holds poses back",
+            f"swap the columns {u} and {x}, or change the sign of the column {name}",
+        )
+    return (
+        f"{name} looks inverted: {told}; expected is"
+        " what the world exerts on the object, so pressing on the floor gives F_z > 0",
+        f"change the sign of the column {name}, or of its frame",
+    )
+
+
+def _wrong_order(episode: Episode) -> tuple[str, str] | None:
+    return misplaced(_rows(episode), episode.stiffness.numpy(), episode.sensor_std.numpy())
+
+
+def _rows(episode: Episode) -> Rows:
+    return episode.commands.numpy(), episode.poses.numpy(), episode.wrenches.numpy()
 
 
 def _expected_wrenches(episode: Episode) -> np.ndarray:

@@ -15,14 +15,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from tpcd.data.episode import Episode
 from tpcd.data.header import SENSOR_NAMES
 from tpcd.errors import EpisodeError
+from tpcd.quality.finding import Finding, Weight
+
+if TYPE_CHECKING:
+    from tpcd.data.episode import Episode
 
 FEWEST_PAUSES = 3
 """Repeats below which their scatter says nothing."""
@@ -142,8 +146,8 @@ def check_noise(episode: Episode) -> list[str]:
             raise EpisodeError(
                 path,
                 f"sensor_std of {name} is {stated[k]:g}, plainly too large: {found}",
-                "give one standard deviation in SI units, or leave sensor_std out to have it"
-                " estimated",
+                "give one standard deviation in SI units, or leave sensor_std out for"
+                " scripts/diagnose.py to estimate it",
             )
     warnings = []
     for name, k, ratio, freedom, source in measured:
@@ -157,6 +161,14 @@ def check_noise(episode: Episode) -> list[str]:
             )
         warnings.append(f"{told}: it is too small, or the arm creeps or lags")
     return warnings
+
+
+def noise_findings(episode: Episode) -> list[Finding]:
+    """What speaks against the stated noise, as doubts; `check_noise` refuses the gravest."""
+    try:
+        return [Finding("row", Weight.DOUBT, line) for line in check_noise(episode)]
+    except EpisodeError as error:
+        return [Finding("row", Weight.DOUBT, error.problem, remedy=error.remedy)]
 
 
 def _fisher(first: float, second: float) -> float:

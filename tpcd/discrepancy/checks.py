@@ -16,8 +16,7 @@ from tpcd.data.checks import (
     INVERTED,
     check_scale,
     episode_findings,
-    inverted_remedy,
-    inverted_sentence,
+    inverted_told,
     wrench_ratios,
 )
 from tpcd.data.doubts import doubts_told
@@ -81,7 +80,7 @@ def _check_signs(path: Path, episode: Episode) -> None:
     # The torque may turn with the point that it is about.
     for name, ratios in wrench_ratios(episode).items():
         if name != "tau" and all(ratio < INVERTED for ratio in ratios):
-            raise EpisodeError(path, inverted_sentence(name, ratios[0]), inverted_remedy(name))
+            raise EpisodeError(path, *inverted_told(episode, name, ratios[0]))
 
 
 def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:

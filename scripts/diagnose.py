@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tpcd.cli import check_numbers, run
+from tpcd.cli import check_numbers, check_resume, run
 
 USUAL_OUT = Path("runs/diagnosis")
 
@@ -39,8 +39,7 @@ class Diagnose:
         check_numbers(self)
         if bool(self.episodes) == bool(self.compare):
             raise ValueError("give episodes to diagnose, or runs to --compare")
-        if self.resume and self.overwrite:
-            raise ValueError("give --resume or --overwrite, not both")
+        check_resume(self)
 
 
 def diagnose_episodes(config: Diagnose) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tpcd.cli import check_numbers, run
+from tpcd.cli import check_numbers, check_resume, run
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,7 @@ class Estimate:
         check_numbers(self, least={"particles": 16}, above=above, most=most)
         if self.model is not None and self.estimator == "paper":
             raise ValueError("the estimator paper has a model of its own; leave --model out")
-        if self.resume and self.overwrite:
-            raise ValueError("give --resume or --overwrite, not both")
+        check_resume(self)
 
 
 def estimate_episode(config: Estimate) -> None:
@@ -56,7 +55,12 @@ def estimate_episode(config: Estimate) -> None:
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
-    from tpcd.commands.plausibility import check_start_pose, contradicted_start, keep_doubts
+    from tpcd.commands.plausibility import (
+        check_start_pose,
+        contradicted_start,
+        keep_doubts,
+        keep_rows,
+    )
     from tpcd.commands.summary import parameter_rows
     from tpcd.data import check_episode, read_episode
     from tpcd.data.checks import check_units
@@ -94,6 +98,7 @@ def estimate_episode(config: Estimate) -> None:
     with opened as folder:
         keep_model(model, folder, config.model)
         keep_doubts(episode, folder)
+        keep_rows([episode], folder)
         state = load_state(folder, episode, config.prior)
         settings = EstimatorSettings(
             sampler=SamplerSettings(particles=config.particles),

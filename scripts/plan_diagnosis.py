@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from tpcd.truth.diagnosis_plan import Planned
 
-FAR = 5.0
-"""A length beyond this was meant in another unit [m]."""
+FAR, TURNED = 5.0, 6.3
+"""A length or angle beyond this was meant in another unit [m, rad]."""
 ROOM = 0.002
 """What the limits of the arm leave besides [m]."""
 
@@ -76,6 +76,9 @@ class Planning:
                 raise ValueError(f"a plan needs --{name}: where the hand is at touch, roughly [m]")
             if abs(value) > FAR:
                 raise ValueError(f"{name} is {value:g}, expected m; it looks like millimetres")
+        if abs(self.start[2]) > TURNED:
+            told = f"start phi is {self.start[2]:g}, expected rad; it looks like degrees"
+            raise ValueError(told)
 
 
 def plan_diagnosis(config: Planning) -> None:
@@ -189,18 +192,17 @@ def _robot_line(config: Planning, out: Path, plan: Sequence[Planned]) -> str:
 def _complete(config: Planning) -> None:
     import sys
 
-    from tpcd.data import read_episode
-    from tpcd.data.doubts import doubts_told
+    from tpcd.discrepancy.checks import read_data
     from tpcd.discrepancy.coverage import MOTIONS, coverage_of
     from tpcd.effects import CATALOGUE
     from tpcd.results import format_table
 
-    episodes = [read_episode(path) for path in config.after]
-    for episode in episodes:
-        told = doubts_told(episode.doubts, episode.path)
-        if told:
-            print(f"warning: {told}", file=sys.stderr)
-    coverage = coverage_of(episodes)
+    data = read_data(config.after)
+    for warning in (*data.warnings, *data.notes):
+        print(f"warning: {warning}", file=sys.stderr)
+    if data.answer is not None:
+        raise ValueError(data.answer.sentence)
+    coverage = coverage_of(data.episodes)
     lacks = {effect.name: coverage.missing(effect.needs) for effect in CATALOGUE}
     rows = []
     for need, motion in MOTIONS.items():

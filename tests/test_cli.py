@@ -142,11 +142,13 @@ def test_a_wrong_argument_is_one_line_and_exit_code_2(
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (b"", "holds nothing, expected settings by name"),
-        (b"a line of text", "holds a str, expected settings by name"),
+        (b"", "holds nothing, expected entries by name"),
+        (b"a line of text", "holds a str, expected entries by name"),
         (b"step,u_x\n0,1\n", "holds a str"),
         (b"seeds: [", "not valid YAML at line 1"),
         (b"\xff\xfe", "not a UTF-8 text file"),
+        (b"memory: [1]", "memory is [1], expected settings by name"),
+        (b"seeds: [1]\nseeds: [2]", "key seeds appears twice; remove one of them"),
         (b"sedes: [1]", "unknown setting 'sedes' in the configuration; did you mean seeds?"),
     ],
 )
@@ -209,6 +211,7 @@ def failing(error: BaseException):
         (ValueError("friction is -1, expected >= 0"), 2, "friction is -1"),
         (FileNotFoundError(2, "No such file or directory", "gone.csv"), 2, "gone.csv"),
         (PermissionError(13, "Permission denied", "/x"), 2, "/x: Permission denied; choose a"),
+        (ModuleNotFoundError("No module named 'x'", name="x"), 2, "a package does not load (No m"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
@@ -226,8 +229,9 @@ def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_mistake_in_the_program_is_not_hidden() -> None:
-    with pytest.raises(ZeroDivisionError):
-        run(failing(ZeroDivisionError()), Settings, ("a", "b"), positional=POSITIONAL)
+    for error in (ZeroDivisionError(), ModuleNotFoundError("no such part", name="tpcd.part")):
+        with pytest.raises(type(error)):
+            run(failing(error), Settings, ("a", "b"), positional=POSITIONAL)
 
 
 @pytest.mark.parametrize("code", [None, 0, 3])

@@ -194,7 +194,7 @@ def test_predictions_of_a_stopped_run_or_an_inverted_sensor_are_warned_of(
         call("predict", str(tmp_path / "run"), str(file), "--out", str(tmp_path / out))
         return capsys.readouterr().err
 
-    assert "warning" not in told(world / "explore.csv", "whole.csv")
+    assert "warning" not in told(world / "test.csv", "whole.csv")
     assert "upside_down.csv: F_z looks inverted" in told(tmp_path / "upside_down.csv", "wrong.csv")
     (tmp_path / "run" / "results.json").unlink()
     assert "was stopped before it was done" in told(world / "explore.csv", "part.csv")

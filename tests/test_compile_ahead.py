@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tpcd import compile_ahead
+from tpcd import compile_ahead, loops
 
 # Counts what numba compiles or loads for an estimate that comes after.
 USE = """
@@ -57,3 +57,10 @@ def test_without_numba_there_is_nothing_to_compile(monkeypatch, capsys) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     compile_ahead.compile_ahead(compile_ahead.CompileAhead())
     assert "nothing to compile" in capsys.readouterr().out
+
+
+def test_a_numba_that_does_not_load_is_told_once_and_none(monkeypatch, capsys) -> None:
+    """As beside a NumPy that is too new for it."""
+    monkeypatch.setitem(sys.modules, "numba.core.caching", None)
+    assert loops.available.__wrapped__() is False
+    assert "numba is installed, but does not load" in capsys.readouterr().err

@@ -224,6 +224,7 @@ def test_the_command_explores_stops_and_goes_on(
         (("--workspace_low", "1", "1", "1"), "workspace"),
         (("--policy", "brave"), "policy"),
         (("--task", "nowhere.csv"), "nowhere.csv"),
+        (("--resume", "--overwrite"), "give --resume or --overwrite, not both"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(
@@ -265,6 +266,8 @@ def test_what_was_enough_before_a_stop_needs_no_further_move(scene: Scene, tmp_p
     episode, state = step.episode, step.estimation.state
     task = Task(episode.poses[:1], episode.commands[1:], episode.commands[:1])
     error = expected_error(step.estimation.belief, task)
+    with pytest.raises(ValueError, match="the task is for an arm of stiffness"):
+        expected_error(step.estimation.belief, replace(task, stiffness=2 * episode.stiffness))
 
     def moves() -> Iterator[ExplorationStep]:
         raise AssertionError("no move was needed")

@@ -126,6 +126,23 @@ def test_a_plan_that_could_harm_is_refused(
         diagnosis_plan(torch.tensor(start).double(), FLOOR_Z, wall, STIFFNESS, 60, error)
 
 
+def test_an_arm_too_stiff_for_any_step_is_refused_for_that() -> None:
+    with pytest.raises(ValueError, match="stiffness of 1e.06 N/m a step of 0.001 m alone means"):
+        diagnosis_plan(START, FLOOR_Z, WALL_X, 1e4 * STIFFNESS, 30, 0.0)
+
+
+def test_episodes_of_two_set_ups_lack_nothing_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--object", "mug", "--steps", "2", "--truth", "quasistatic")
+    for name, stiffness in (("a", "100"), ("b", "200")):
+        more = ("--stiffness", stiffness, stiffness, "50", "--out", str(tmp_path / name))
+        assert call("plan_diagnosis", *words, *more) == 0
+    given = [str(tmp_path / f"{name}.csv") for name in "ab"]
+    assert call("plan_diagnosis", "--after", *given) == 2
+    assert "one set-up" in capsys.readouterr().err
+
+
 def test_a_stiffness_in_newtons_per_millimetre_is_refused() -> None:
     with pytest.raises(ValueError, match="check that the stiffness is in N/m"):
         diagnosis_plan(START, FLOOR_Z, WALL_X, 1e-3 * STIFFNESS, 60, 0.005)
@@ -206,6 +223,10 @@ BAD = {
     "millimetres": (
         ("--start", "0", "120", "0", "--floor-height", "0", "--wall-position", "1", "--out", "a"),
         "start z is 120, expected m",
+    ),
+    "degrees": (
+        ("--start", "0", "0.1", "30", "--floor-height", "0", "--wall-position", "1", "--out", "a"),
+        "start phi is 30, expected rad; it looks like degrees",
     ),
     "no episode": (("--after", "nowhere.csv"), "nowhere.csv: no such file"),
 }

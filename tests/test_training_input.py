@@ -113,6 +113,10 @@ def test_an_outline_with_nan_is_refused_with_its_name(
         ("check.mask_cells=100000", "mask_cells is 100000, expected at most"),
         ("check.mask_cells=1.5", "check.mask_cells"),
         ("data.leave_out=['']", "leave_out or only holds an empty name"),
+        ("data.leave_out=['zzz']", "leave_out names zzz, with which no outline's name begins"),
+        ("data.largest_size=260", "largest_size is 260, expected at most 5 in size; lengths are"),
+        ("name=..", "name is '..', expected the plain name of a folder"),
+        ("name=a/b", "name is 'a/b', expected the plain name of a folder"),
         ("unseen_from=no-such-prior", "no-such-prior: holds no prior"),
     ],
 )
@@ -120,6 +124,14 @@ def test_settings_out_of_range_are_refused_before_anything_is_trained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, expected: str
 ) -> None:
     assert expected in refused(capsys, tmp_path / "run", f"--{option}")
+
+
+def test_a_run_is_not_replaced_by_its_own_prior(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert "is the folder of the run" in refused(capsys, out, f"--export={out}")
+    assert "not both" in refused(capsys, out, "--resume", "--overwrite")
 
 
 def test_fewer_latents_in_between_than_components_are_refused() -> None:

@@ -20,7 +20,13 @@ from tpcd.errors import EpisodeError
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.truth.motions import FORCE_LIMIT, LARGEST_TILT, History, PlannedMotion, planned_test
-from tpcd.truth.recording import make_motion, read_truth, record, write_recording
+from tpcd.truth.recording import (
+    check_truth,
+    make_motion,
+    read_truth,
+    record,
+    write_recording,
+)
 from tpcd.truth.scene import Scene, draw_scene, make_truth
 
 SIMULATE = Path(__file__).parents[1] / "scripts" / "simulate.py"
@@ -223,6 +229,14 @@ def test_a_recording_reads_back_with_its_truth_and_raises_no_warning(tmp_path):
     assert torch.equal(read_scene.vertices_ee, scene.vertices_ee)
     with pytest.raises(EpisodeError, match="exists already"):
         write_recording(recording, scene, path)
+    check_truth(episode, true)
+    for values, told in (
+        ({"poses": true.poses + torch.tensor([0.0, 0.004, 0.0])}, "column z: differs by -0.0"),
+        ({"wrenches": true.wrenches.flip(0)}, "from the truth beside it, and its noise is 0.3"),
+        ({"commands": true.commands.flip(0)}, "has other commands than the truth"),
+    ):
+        with pytest.raises(EpisodeError, match=told):
+            check_truth(episode, replace(true, **values))
     scene_path = tmp_path / "mug.v2.truth.yaml"
     scene_path.write_text("theta: {scale: 1}")
     with pytest.raises(EpisodeError, match="not a truth file"):

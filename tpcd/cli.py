@@ -48,6 +48,8 @@ Config = TypeVar("Config")
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+OWN = ("tpcd", "training", "eval")
+"""Packages of this project; what they lack of each other is a mistake in the program."""
 LARGEST_SEED = 2**63 - 1
 """Seeds beyond this do not fit into every generator of random numbers."""
 
@@ -66,10 +68,10 @@ def run(
     `positional` names the fields given without an option name, in order; a list or tuple
     among them takes one or more values. `argv` defaults to the process's arguments, `prog`
     to how the command was called, `description` to the docstring of `main`. A `TpcdError`,
-    `ValueError` or `OSError` from `main` becomes one line on stderr and a non-zero exit
-    code, with the traceback before it under `--debug`; Ctrl-C gives 130. Anything else is
-    a mistake in the program and keeps its traceback. What the console cannot show or take changes
-    neither the work nor, but for a full disk behind it, the exit code (`console`).
+    `ValueError`, `OSError`, or a package that does not load, becomes one line on stderr and a
+    non-zero exit code, with the traceback before it under `--debug`; Ctrl-C gives 130. Anything
+    else is a mistake in the program and keeps its traceback. What the console cannot show or take
+    changes neither the work nor, but for a full disk behind it, the exit code (`console`).
     """
     prog = prog or _program_name()
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -105,11 +107,15 @@ def _code_of(
     except KeyboardInterrupt as stop:
         print(f"{prog}: interrupted" + (f"; {stop}" if str(stop) else ""), file=sys.stderr)
         return EXIT_INTERRUPTED
-    except (TpcdError, ValueError, OSError) as error:
+    except (TpcdError, ValueError, OSError, ImportError) as error:
+        if isinstance(error, ImportError) and (error.name or "").partition(".")[0] in OWN:
+            raise
         if debug:
             traceback.print_exc()
         if isinstance(error, OSError):
             line = system_problem(error)
+        elif isinstance(error, ImportError):
+            line = f"a package does not load ({error}); install tpcd and what it needs anew"
         else:
             line = " ".join(str(error).split()) or type(error).__name__
         print(f"{prog}: error: {line}", file=sys.stderr)
@@ -129,7 +135,7 @@ def parse(
     Raises `ValueError` with one line for an argument that is unknown, missing or of the
     wrong type; `--help`, `--version` and `--print_config` print and exit.
     """
-    from jsonargparse import ArgumentError
+    from jsonargparse import ArgumentError, Namespace
 
     parser = _parser(config, positional, prog, description)
     words, files = _config_first([_underscored(word) for word in argv])
@@ -137,6 +143,9 @@ def parse(
     names = [field.name for field in dataclasses.fields(typing.cast(Any, config))]
     try:
         values = parser.parse_args(words)
+        for name, kind in typing.get_type_hints(config).items():
+            if dataclasses.is_dataclass(kind) and not isinstance(values[name], Namespace):
+                raise ValueError(f"{name} is {values[name]!r}, expected settings by name")
         values = parser.instantiate(values)
     except ArgumentError as error:
         problem = parsing_problem(str(error), [*names, "config", "debug"])
@@ -152,6 +161,12 @@ def parse(
     if missing:
         raise ValueError(f"{' and '.join(missing)} missing; see {prog} --help")
     return config(**settings)
+
+
+def check_resume(config: Any) -> None:
+    """Refuse, for `__post_init__`, to go on with a run and replace it at once."""
+    if config.resume and config.overwrite:
+        raise ValueError("give --resume or --overwrite, not both")
 
 
 def check_numbers(

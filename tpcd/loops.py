@@ -28,8 +28,14 @@ FOLDERS = tuple(Path(__file__).parent / name for name in ("belief", "effects", "
 
 @cache
 def available() -> bool:
-    """Whether numba is installed; if so, it has a place for what it compiles from now on."""
+    """Whether numba is installed and loads; if so, it has a place for what it compiles from now
+    on."""
     if find_spec("numba") is None:
+        return False
+    try:
+        import numba.core.caching  # noqa: F401
+    except ImportError as error:  # as beside a NumPy that is too new for it
+        print(f"note: numba is installed, but does not load ({error})", file=sys.stderr)
         return False
     if any(_kept_in(folder) is None for folder in FOLDERS):
         _keep_elsewhere()

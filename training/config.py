@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from tpcd.cli import check_numbers
+
+LARGEST = 5.0
+"""An outline larger than this was meant in another unit [m]."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self, {"smallest_size": 0, "builtin_variants": 0})
-        check_numbers(self, {"largest_size": self.smallest_size})
+        check_numbers(self, {"largest_size": self.smallest_size}, most={"largest_size": LARGEST})
         if any(not name for name in (*self.leave_out, *self.only)):
             raise ValueError("leave_out or only holds an empty name, expected names of outlines")
 
@@ -173,6 +177,8 @@ class TrainingConfig:
     """How the result is checked."""
 
     def __post_init__(self) -> None:
+        if self.name in ("", ".", "..") or Path(self.name).name != self.name:
+            raise ValueError(f"name is {self.name!r}, expected the plain name of a folder")
         needed = 2 * self.layout.components
         if self.network.latent_dim > 2 and self.layout.between < needed:
             raise ValueError(

@@ -29,6 +29,12 @@ def training_outlines(
     else:
         views = load_ycb("main" if config.source == "ycb21" else "all")
         found = {name: outline.vertices for name, outline in views.items()}
+    idle = [n for n in config.leave_out if not any(name.startswith(n) for name in found)]
+    if idle:
+        raise ValueError(
+            f"data.leave_out names {', '.join(idle)}, with which no outline's name begins; expected"
+            f" beginnings of {', '.join(found)}"
+        )
     if config.source == "ycb21":
         found = {name: found[name] for name in GRASPABLE_21}
     else:

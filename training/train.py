@@ -10,12 +10,12 @@ import time
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from tpcd.cli import run
+from tpcd.cli import check_resume, run
 from tpcd.errors import RunError
 from tpcd.files import read_json
 from tpcd.ownership import owned
-from tpcd.plain_yaml import read_yaml
-from tpcd.results import CONFIG_FILE, resumed_run, run_folder, write_results
+from tpcd.records import read_entries
+from tpcd.results import CONFIG_FILE, RESTORE, resumed_run, run_folder, write_results
 from tpcd.targets import check_folder
 from training.config import TrainingConfig
 
@@ -37,6 +37,10 @@ class Training(TrainingConfig):
     overwrite: bool = False
     """Replace an earlier run in the folder, and an earlier prior in that of the export."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_resume(self)
+
 
 def train_prior(config: Training) -> None:
     """Train a shape prior, measure it and write it with its card."""
@@ -50,6 +54,8 @@ def train_prior(config: Training) -> None:
     out = config.out or Path("runs") / config.name
     export = config.export or out / config.name
     again = config.overwrite or config.resume or config.export is None
+    if export.resolve() == out.resolve():
+        raise RunError(export, "is the folder of the run", "name another one with --export")
     check_folder(export, again)
     began, began_cpu = time.perf_counter(), time.process_time()
     if config.resume:
@@ -74,8 +80,8 @@ def _check_same_optimiser(out: Path, config: Training) -> None:
     """Refuse to resume with settings by which the steps ahead would be other ones: only how many
     there are, and on how many threads, may change."""
     path = out / CONFIG_FILE
-    saved = read_yaml(path, RunError) if path.is_file() else None
-    before = saved.get("optim") if isinstance(saved, dict) else None
+    saved = read_entries(path, RESTORE) if path.is_file() else {}
+    before = saved.get("optim")
     if not isinstance(before, dict):
         raise RunError(out, f"holds no {CONFIG_FILE} of a training", "leave out --resume")
     differing = [

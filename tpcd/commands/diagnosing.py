@@ -18,6 +18,7 @@ from tpcd.belief.storage import save_belief
 from tpcd.commands.diagnosis_figures import draw_diagnosis
 from tpcd.commands.diagnosis_rows import shown_coverage, shown_evidence, shown_tests
 from tpcd.commands.gap_rows import shown_data, shown_gaps, shown_share
+from tpcd.commands.plausibility import keep_rows
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.discrepancy.memory import Memory, digest
@@ -84,6 +85,7 @@ def write_diagnosis(
         model = Model(belief.prior.effects, belief.step, found_effects(belief), shape)
         write_model(model, folder / "model.yaml", diagnosis.sentence)
         save_belief(belief, folder, prior)
+        keep_rows(episodes, folder)
         figures = draw_diagnosis(diagnosis, episodes, least_gain)
     images = {}
     for name, (figure, caption) in figures.items():

@@ -39,7 +39,7 @@ FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
-WITHOUT_LOOPS = "warning: numba is not installed, so that each step takes about 20 times as long"
+WITHOUT_LOOPS = "warning: there is no numba, so that each step takes about 20 times as long"
 FEWER_DRAWS = f" and the last belief gets {CLOSING_SHARE_WITHOUT_LOOPS:.1%} of its draws"
 LOOPS = "; for the compiled loops: pip install 'tpcd[fast]'"
 """What is told of the compiled loops where they are missing; the middle part where there is a

@@ -20,7 +20,7 @@ from tpcd.commands.drawing import KnownTruth
 from tpcd.commands.exploration_run import Kept, Stopping, run_exploration
 from tpcd.commands.exploring_options import ExploringOptions
 from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
-from tpcd.commands.plausibility import keep_doubts
+from tpcd.commands.plausibility import keep_doubts, keep_rows
 from tpcd.commands.summary import parameter_rows
 from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
@@ -162,6 +162,7 @@ def explore_in_folder(
         except KeyboardInterrupt as stop:
             where = getattr(robot, "at_rest", None)
             raise KeyboardInterrupt(*([where] if where else [])) from stop
+        keep_rows([episode], folder)
         _finish(options, folder, belief, episode, reason, on_stage.truth)
 
 
@@ -217,4 +218,5 @@ def _task(path: Path) -> Task:
     told = doubts_told(episode.doubts, episode.path)
     if told:
         print(f"warning: {told}", file=sys.stderr)
-    return Task(episode.poses[:-1], episode.commands[1:], episode.commands[:-1])
+    rows = episode.poses[:-1], episode.commands[1:], episode.commands[:-1]
+    return Task(*rows, stiffness=episode.stiffness)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tpcd.cli import check_numbers
+from tpcd.cli import check_numbers, check_resume
 
 WEIGHING = ("active", "lookahead", "grid")
 """Policies that weigh commands against each other."""
@@ -63,6 +63,7 @@ class ExploringOptions:
             above={"force_limit": 0.0, "stop_gain": 0.0, "stop_error": 0.0, "step_limit": 0.0},
             most={"stop_error": 0.1} | dict.fromkeys(EXTENTS, LARGEST_EXTENT),
         )
+        check_resume(self)
         if self.stop_error is not None and self.task is None:
             raise ValueError("stop_error needs a task to predict; name an episode with --task")
         if self.model is not None and self.estimator == "paper":

@@ -21,6 +21,7 @@ from tpcd.data.checks import NO_CONTACT, episode_findings
 from tpcd.data.doubts import doubts_told
 from tpcd.data.episode import Episode
 from tpcd.data.noise import noise_findings
+from tpcd.data.same_rows import row_marks, rows_among
 from tpcd.data.table import row_name
 from tpcd.effects.shape_change import ShapeChange
 from tpcd.errors import EpisodeError
@@ -31,7 +32,7 @@ from tpcd.records import fitting, read_entries
 from tpcd.results import RESULTS_FILE
 from tpcd.shape.protocol import Shape
 
-DOUBTS_FILE = "doubts.json"
+DOUBTS_FILE, ROWS_FILE = "doubts.json", "learnt_rows.json"
 DRAWS = 1000
 """Draws from the prior; what one draw in 100 explains is missed 4 times in 100,000."""
 OUTLINE_ERROR = 5e-3
@@ -128,6 +129,11 @@ def keep_doubts(episode: Episode, run: Path) -> None:
         write_json(run / DOUBTS_FILE, {"episode_doubts": told})
 
 
+def keep_rows(episodes: Sequence[Episode], run: Path) -> None:
+    """Write beside a belief which rows it was learnt from."""
+    write_json(run / ROWS_FILE, {"rows": [row_marks(episode) for episode in episodes]})
+
+
 def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
     """What is suspicious about predicting these episodes from a run."""
     found = []
@@ -139,13 +145,32 @@ def run_warnings(run: Path, episodes: Sequence[Episode]) -> list[str]:
             entries = read_entries(run / name, remedy)
             with fitting(run / name, remedy):
                 found += [f"{run}{told}" for told in told_by(entries) if told]
+    learnt, given = _rows_of(run), set()
     for episode in episodes:
         name = "" if episode.path is None else f"{episode.path.name}: "
+        known, again = rows_among(episode, learnt), rows_among(episode, given)
+        given |= set(row_marks(episode))
+        of = f"of {len(episode) - 1} rows are"
+        if known:
+            told = f"what {run} was learnt from: they show how it fits, not how it predicts"
+            found.append(f"{name}{len(known)} {of} {told}")
+        if again:
+            found.append(f"{name}{len(again)} {of} given more than once, and count as often")
         told = doubts_told(episode.doubts, episode.path)
         found += [told] if told else []
         odd = [*episode_findings(episode), *noise_findings(episode)]
         found += [f"{name}{each}" for each in map(str, odd) if each != NO_CONTACT]
     return found
+
+
+def _rows_of(run: Path) -> set[str]:
+    """Marks of the rows that a run was learnt from, where it tells."""
+    path, remedy = run / ROWS_FILE, "restore it, or estimate again"
+    if not path.is_file():
+        return set()
+    entries = read_entries(path, remedy)
+    with fitting(path, remedy):
+        return {str(mark) for marks in entries["rows"] for mark in marks}
 
 
 def _told_by_doubts(doubts: Mapping[str, Any]) -> list[str]:

@@ -24,6 +24,7 @@ from tpcd.data.limits import (
     check_jumps,
 )
 from tpcd.data.noise import noise_findings
+from tpcd.data.same_rows import copied_rows
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 from tpcd.quality.episode_rows import check_repeats
@@ -190,7 +191,7 @@ def episode_findings(episode: Episode) -> list[Finding]:
             found.append(Finding("wrench", Weight.DOUBT, told))
     if not significant.any() and not (felt.sum(0) >= LEAST_FELT).any():
         found.append(Finding("contact", Weight.DOUBT, NO_CONTACT))
-    found += repeated_readings(episode)
+    found += [*repeated_readings(episode), *copied_rows(episode)]
     silent = [name for name, value in zip(SENSOR_NAMES, noise, strict=True) if value == 0]
     if silent:
         told = f"sensor_std of {', '.join(silent)} is 0: {FREE_OF_NOISE}"

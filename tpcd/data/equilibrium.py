@@ -59,23 +59,38 @@ def departure(
     to do; None where they do not. The free start is no part of it."""
     from scipy.stats import chi2
 
-    scale = _noise(stiffness, sensor_std)
-    away = (rows[2] - _expected(rows, stiffness))[1:]
-    known = scale > 0
-    if not known.any():
+    ratios, count = _ratios(rows, stiffness, sensor_std)
+    together = noise_ratio(rows, stiffness, sensor_std)
+    if together is None or together < LARGE or chi2.sf(count * together**2, count) > SURE:
         return None
-    ratios = np.sqrt(np.square(away[:, known] / scale[known]).mean(0))
-    together, count = float(np.sqrt(np.square(ratios).mean())), away[:, known].size
-    if together < LARGE or chi2.sf(count * together**2, count) > SURE:
-        return None
-    worst = int(np.flatnonzero(known)[ratios.argmax()])
+    worst = int(np.nanargmax(ratios))
     name, unit = (("F_x", "N"), ("F_z", "N"), ("tau", "N·m"))[worst]
+    left = ratios[worst] * _noise(stiffness, sensor_std)[worst]
     return (
-        f"{name} differs from K (pose - command) by {ratios.max() * scale[worst]:.2g} {unit} (root"
-        f" mean square), {ratios.max():.2g} times the noise",
+        f"{name} differs from K (pose - command) by {left:.2g} {unit} (root mean square),"
+        f" {ratios[worst]:.2g} times the noise",
         "the stiffness, the sensor or sensor_std is not what the YAML says, and an estimate is off"
         " by more than its intervals: let scripts/diagnose.py find which",
     )
+
+
+def noise_ratio(
+    rows: Rows, stiffness: Float[np.ndarray, " 3"], sensor_std: Float[np.ndarray, " 6"]
+) -> float | None:
+    """What K (pose - command) leaves of the wrench over its noise, root mean square; about 1 where
+    all is as it should be, None where no noise is stated."""
+    ratios, _ = _ratios(rows, stiffness, sensor_std)
+    return None if np.isnan(ratios).all() else float(np.sqrt(np.nanmean(np.square(ratios))))
+
+
+def _ratios(
+    rows: Rows, stiffness: Float[np.ndarray, " 3"], sensor_std: Float[np.ndarray, " 6"]
+) -> tuple[Float[np.ndarray, " 3"], int]:
+    """The same for each channel, NaN without noise, and how many readings that is of."""
+    scale = _noise(stiffness, sensor_std)
+    scale = np.where(scale > 0, scale, np.nan)
+    left = (rows[2] - _expected(rows, stiffness))[1:] / scale
+    return np.sqrt(np.square(left).mean(0)), int(np.isfinite(left).sum())
 
 
 def _noise(

@@ -26,6 +26,7 @@ from tpcd.data.header import Header, read_header
 from tpcd.data.measured import read_measured
 from tpcd.data.noise import check_noise
 from tpcd.data.noisy import read_noisy
+from tpcd.data.same_rows import row_marks, rows_among
 from tpcd.discrepancy.diagnosis import Diagnosis
 from tpcd.errors import EpisodeError
 
@@ -64,8 +65,9 @@ def read_data(paths: Sequence[Path], fresh: Sequence[Path] = ()) -> Data:
             doubts = [line for line in [doubts_told(header.doubts, table)] if line]
             return Data((), (), tuple(doubts), answer=_without_commands(table, header))
     episodes, notes = read_noisy(paths, fresh)
-    for (table, _), episode in zip(places, episodes, strict=True):
+    for k, ((table, _), episode) in enumerate(zip(places, episodes, strict=True)):
         _check_signs(table, episode)
+        _check_new(table, episode, episodes[:k])
     doubts = [doubts_told(episode.doubts, episode.path) for episode in episodes]
     told = [line for line in doubts if line]
     told += [line for episode in episodes for line in check_noise(episode)]
@@ -81,6 +83,18 @@ def _check_signs(path: Path, episode: Episode) -> None:
     for name, ratios in wrench_ratios(episode).items():
         if name != "tau" and all(ratio < INVERTED for ratio in ratios):
             raise EpisodeError(path, *inverted_told(episode, name, ratios[0]))
+
+
+def _check_new(path: Path, episode: Episode, before: Sequence[Episode]) -> None:
+    for other in before:
+        again = rows_among(episode, set(row_marks(other)))
+        if again:
+            raise EpisodeError(
+                path,
+                f"{len(again)} of {len(episode) - 1} rows (row {again[0]} first) are also in"
+                f" {other.path}",
+                "give each recording once, and as --fresh what was not learnt from",
+            )
 
 
 def check_one_set_up(paths: Sequence[Path], headers: Sequence[Header]) -> None:

@@ -31,6 +31,7 @@ from tpcd.policies.limits import Limits
 from tpcd.policies.lookahead import second_step_gain
 from tpcd.policies.protocol import Choice, Situation
 from tpcd.predict import ContactPredictor
+from tpcd.prediction import Prediction
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,14 @@ class Task:
     previous: Float[Tensor, "n 3"] | None = None
     tolerance: tuple[float, float, float] = (1e-3, 1e-3, 5e-3)
     """Errors of the settled pose that count alike [m, m, rad]; forces follow from them."""
+    stiffness: Float[Tensor, " 3"] | None = None
+    """Stiffness that the commands are for [N/m, N/m, N·m/rad]; None: that of the belief."""
 
     def answers(
         self, predictor: ContactPredictor
     ) -> tuple[Float[Tensor, "m v"], Float[Tensor, "m v j"] | None]:
         """What particles predict, and how that answers their fields, in units of the tolerance."""
-        prediction = predictor.predict(self.poses, self.commands, self.previous, keep_field=True)
+        prediction = self._predicted(predictor, keep_field=True)
         scale = torch.tensor(self.tolerance, dtype=torch.float64)
         field = prediction.component_field
         if field is not None:
@@ -82,8 +85,18 @@ class Task:
 
     def predicted_error(self, predictor: ContactPredictor) -> Float[Tensor, " 6"]:
         """Root mean square error that the belief expects of its predictions, each channel."""
-        prediction = predictor.predict(self.poses, self.commands, self.previous)
-        return prediction.std.square().mean(0).sqrt()
+        return self._predicted(predictor).std.square().mean(0).sqrt()
+
+    def _predicted(self, predictor: ContactPredictor, keep_field: bool = False) -> Prediction:
+        """What the belief predicts; `ValueError` where its arm is not the one of the commands."""
+        if self.stiffness is not None:
+            own, asked = predictor.belief.stiffness.tolist(), self.stiffness.tolist()
+            if not torch.allclose(self.stiffness, predictor.belief.stiffness):
+                raise ValueError(
+                    f"the task is for an arm of stiffness {asked}, and this one has {own}; name an"
+                    " episode recorded with the same controller"
+                )
+        return predictor.predict(self.poses, self.commands, self.previous, keep_field=keep_field)
 
 
 class ActivePolicy:

@@ -87,8 +87,13 @@ def diagnosis_plan(
             f" {wall_position - error:g} (wall)"
         )
     reach = [FORCE_LIMIT / k - error for k in stiffness.tolist()[:2]]
+    least = FORCE_LIMIT / max(stiffness.tolist()[:2]) - LEAST_REACH
+    if least <= 0:
+        raise ValueError(
+            f"at a stiffness of {max(stiffness.tolist()[:2]):g} N/m a step of {LEAST_REACH:g} m"
+            f" alone means {FORCE_LIMIT:g} N; give the arm a softer one"
+        )
     if min(reach) <= LEAST_REACH:
-        least = FORCE_LIMIT / max(stiffness.tolist()[:2]) - LEAST_REACH
         raise ValueError(
             f"error is {error:g} m, which at this stiffness alone means {FORCE_LIMIT:g} N; expected"
             f" floor and wall to be known within less than {least:g} m"

@@ -16,11 +16,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.data.checks import NOISE_FACTOR, ROUNDING
 from tpcd.data.episode import Episode
 from tpcd.data.files import episode_contents, read_rows, write_together
-from tpcd.data.header import Header
+from tpcd.data.header import SENSOR_NAMES, Header
+from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 from tpcd.plain_yaml import read_yaml, to_yaml
+from tpcd.planar import wrap_angle
 from tpcd.truth.diagnosis_motion import diagnosis_motion
 from tpcd.truth.motions import (
     History,
@@ -220,6 +223,25 @@ def read_truth(path: str | Path) -> tuple[Episode, Scene]:
         priors={},
     )
     return read_rows(_truth_path(path, "csv"), header), scene
+
+
+def check_truth(episode: Episode, true: Episode) -> None:
+    """Refuse a recording whose rows are not the true ones but for its noise; `EpisodeError`."""
+    where, remedy = episode.path or "episode", "remove that .truth.yaml, or restore the recording"
+    if not torch.equal(true.commands, episode.commands):
+        raise EpisodeError(where, "has other commands than the truth beside it", remedy)
+    off = torch.cat((episode.poses - true.poses, episode.wrenches - true.wrenches), dim=-1)
+    off[:, 2] = wrap_angle(off[:, 2])
+    excess = off.abs() - NOISE_FACTOR * episode.sensor_std - ROUNDING
+    row, channel = divmod(int(excess.argmax()), 6)
+    if excess[row, channel] > 0:
+        raise EpisodeError(
+            where,
+            f"{row_name(row, Path(where))}, column {SENSOR_NAMES[channel]}: differs by"
+            f" {float(off[row, channel]):.3g} from the truth beside it, and its noise is"
+            f" {float(episode.sensor_std[channel]):.2g}",
+            remedy,
+        )
 
 
 def _tensor(values: list) -> Tensor:

@@ -67,6 +67,12 @@ def test_a_misfit_without_meaning_is_refused(folder: Path, key: str, value: floa
         load_prior(folder)
 
 
+def test_a_misfit_in_millimetres_is_refused(folder: Path) -> None:
+    _edit_card(folder, misfit_sd_m=1.5)
+    with pytest.raises(CheckpointError, match="'misfit_sd_m' .1.5., expected at most 0.5 m"):
+        load_prior(folder)
+
+
 def test_weights_of_a_larger_network_are_refused(folder: Path) -> None:
     """Regression: layers that the card does not know were dropped without a word."""
     _edit_tensors(folder, lambda t: t.update({"decoder.4.weight": torch.zeros(8, 8)}))

@@ -57,6 +57,7 @@ FAULTS = {
     "negative": ("{scale: [-1, 1]}", "0 < low < high"),
     "endless": ("{scale: [1, .inf]}", "0 < low < high"),
     "no misfit": ("{misfit: 0}", "misfit is 0.0, expected a number above 0"),
+    "in other units": ("{misfit: 1.0e+9}", "expected a number above 0, up to 1000"),
     "not a number": ("{misfit: .nan}", "expected a number above 0"),
     "a list": ("{misfit: [1, 2]}", "misfit: a number"),
 }

@@ -13,6 +13,8 @@ from typing import Any
 
 Bounds = Mapping[str, tuple[float, float]]
 """Ranges of scene entries by name [SI units]."""
+MOST = 1000.0
+"""Times as much error of an outline as can be meant."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,8 @@ class ShapeChange:
         """Refuse what has no meaning."""
         if self.scale is not None and not 0 < self.scale[0] < self.scale[1] < math.inf:
             raise ValueError(f"scale is {list(self.scale)}, expected [low, high], 0 < low < high")
-        if not 0 < self.misfit < math.inf:
-            raise ValueError(f"misfit is {self.misfit}, expected a number above 0")
+        if not 0 < self.misfit <= MOST:
+            raise ValueError(f"misfit is {self.misfit}, expected a number above 0, up to {MOST:g}")
 
     def bounds(self, priors: Bounds) -> Bounds:
         """The priors of an episode with the range of the scale."""

@@ -45,6 +45,8 @@ _MISFIT = {
     "misfit_roughness_per_rad": "roughness",
 }
 """Keys of the card and the fields of `Misfit` that they hold."""
+LARGEST_MISFIT = 0.5
+"""An error of outlines beyond this was written in another unit [m]."""
 _DENSITY = "density."
 """How names of a density's tensors begin."""
 _REMEDY = "export it again with `python -m training.train`, or use a shipped prior"
@@ -225,7 +227,7 @@ def _read_card(path: Path) -> dict[str, Any]:
         newer = isinstance(version, int) and version > FORMAT_VERSION
         raise CheckpointError(
             path,
-            f"has format version {version}, this program reads {FORMAT_VERSION}",
+            f"has format version {version!r}, this program reads {FORMAT_VERSION}",
             _NEWER if newer else _REMEDY,
         )
     return card
@@ -257,7 +259,10 @@ def _misfit(card: Mapping[str, Any]) -> Misfit:
     for key, name in _MISFIT.items():
         if isinstance(found.get(name), bool) or not isinstance(found.get(name, 0.0), (int, float)):
             raise ValueError(f"'{key}' ({found[name]!r}), expected a number")
-    return Misfit(**found | {"sd": card["misfit_sd_m"]})
+    misfit = Misfit(**found | {"sd": card["misfit_sd_m"]})
+    if misfit.sd > LARGEST_MISFIT:
+        raise ValueError(f"'misfit_sd_m' ({misfit.sd}), expected at most {LARGEST_MISFIT} m")
+    return misfit
 
 
 def _read_tensors(path: Path, expected_hash: str) -> dict[str, Tensor]:

@@ -13,10 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from tpcd.logs.log import Log, LogError, RotationKind, RotationNumbers
+from tpcd.quality.defaults import find_defaults
 from tpcd.quality.delay import estimate_delays
 from tpcd.quality.finding import Finding, Weight, overlapping
 from tpcd.quality.recording import check_recording
@@ -64,12 +65,12 @@ def join(
     `findings` are in the times of the streams; `extra` columns go with the samples of the pose.
     Raises `LogError` where the streams do not overlap, or rotations cannot be read.
     """
-    turns = [_turning(stream) for stream in streams]
-    notes = [*notes, *(note for _, note in turns if note)]
+    turns = [_only_readings(stream) for stream in streams]
+    notes = [*notes, *(note for _, told in turns for note in told)]
     parts = {role(stream): stream for stream, _ in turns}
     parts, told = _moved(parts, dict(delays or {}))
     pose, wrench, command = parts["pose"], parts["wrench"], parts.get("command")
-    _check_overlap(path, list(parts.values()), [note for _, note in turns if note])
+    _check_overlap(path, list(parts.values()), [note for _, told in turns for note in told])
     fresh = forward(pose.times)
     again = int((np.diff(pose.times) == 0).sum())
     if again:
@@ -134,22 +135,30 @@ def join(
     )
 
 
-def _turning(stream: Stream) -> tuple[Stream, str]:
-    """The stream without its quaternions of length 0, which are no rotation, and what is told."""
-    if np.isinf(stream.values).any():
-        stream = replace(stream, values=np.where(np.isinf(stream.values), np.nan, stream.values))
-    names = [name.removeprefix("u_") for name in stream.channels]
+def _only_readings(stream: Stream) -> tuple[Stream, list[str]]:
+    """The stream without what is no reading: quaternions of length 0, which are no rotation, and
+    what a driver fills in; and what is told."""
+    values = np.where(np.isinf(stream.values), np.nan, stream.values)
+    names, told = [name.removeprefix("u_") for name in stream.channels], []
+
+    def without(none: Bool[np.ndarray, " k"], what: str) -> None:
+        if none.any():
+            told.append(
+                f"{int(none.sum())} samples of {stream.name} {what}, and are left out"
+                f" (the first is number {int(np.argmax(none)) + 1})"
+            )
+            values[none] = np.nan
+
     places = [names.index(name) for name in ROTATIONS["quaternion"] if name in names]
-    if len(places) < 4:
-        return stream, ""
-    none = np.linalg.norm(stream.values[:, places], axis=1) < NO_TURN
-    if not none.any():
-        return stream, ""
-    note = (
-        f"{int(none.sum())} samples of {stream.name} have a quaternion of length 0, which is no"
-        f" rotation, and are left out (the first is number {int(np.argmax(none)) + 1})"
-    )
-    return replace(stream, values=np.where(none[:, None], np.nan, stream.values)), note
+    if len(places) == 4:
+        none = np.linalg.norm(values[:, places], axis=1) < NO_TURN
+        without(none, "have a quaternion of length 0, which is no rotation")
+    if role(stream) != "command":
+        none = find_defaults(replace(stream, values=values))
+        if none.any():
+            shown = ", ".join(f"{value:.4g}" for value in values[np.argmax(none)])
+            without(none, f"hold ({shown}) as a whole, which is filled in where nothing was read")
+    return (replace(stream, values=values), told) if told else (stream, [])
 
 
 def _moved(

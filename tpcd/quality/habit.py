@@ -78,7 +78,7 @@ def find_habit(values: Float[np.ndarray, " n"], step: float | None = None) -> Ha
     noise, lively = _noise(values, hold, np.repeat(usual, lengths))
     repeated = 1.0 - usual.sum() / max(1.0, lengths[usual].sum() / hold)
     surprise = -math.log(FALSE_ALARM / len(values))
-    for again in (repeated, _middle(step, noise)):
+    for again in (repeated, middle(step, noise)):
         if 0.0 < again < 1.0:
             longest = max(longest, hold * (1.0 + surprise / -math.log(again)))
     lively = lively and step <= COARSEST * noise
@@ -135,6 +135,6 @@ def grid_step(values: Float[np.ndarray, " n"]) -> float:
     return step if whole.mean() > 0.98 and np.median(off) < 50.0 else 0.0
 
 
-def _middle(step: float, noise: float) -> float:
+def middle(step: float, noise: float) -> float:
     """How often a reading repeats whose value is in the middle of a step: at most so often."""
     return math.erf(step / (2.0 * math.sqrt(2.0) * noise)) if noise > 0 else 0.0

@@ -59,3 +59,12 @@ def test_forces_that_are_not_the_springs_are_doubted(
 ) -> None:
     doubts = imported(tmp_path / "run.csv", table(gain)).account.doubts
     assert any(each.kind in ("parity", "convention") for each in doubts) == told
+
+
+@pytest.mark.parametrize("late", [0.3, 0.6])
+def test_what_a_late_set_point_spoils_is_told_by_its_delay(tmp_path: Path, late: float) -> None:
+    columns, count = table(), round(100 * late)
+    for name in [name for name in columns if name.startswith("u_")]:
+        columns[name] = np.concatenate((columns[name][:1].repeat(count), columns[name][:-count]))
+    with pytest.raises(LogError, match=r"the set point is 0\.\d+ s late .*--delay command=0\.\d"):
+        imported(tmp_path / "run.csv", columns)

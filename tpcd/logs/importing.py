@@ -105,7 +105,8 @@ def import_log(log: Log, choices: Importing) -> Imported:
     try:
         planar, settled, choices = _settle(log, choices)
     except LogError as error:
-        raise _likelier(error, (*_better(_unsettled(log, choices), log), *units)) from error
+        likely = (*_better(_unsettled(log, choices), log), *units, *_late(log))
+        raise _likelier(error, likely) from error
     read = _compared(log, settled, choices)
     stiffness = np.array(choices.stiffness)
     if read is not None and read.own.fits:
@@ -150,10 +151,10 @@ def import_log(log: Log, choices: Importing) -> Imported:
     try:
         episode, finding = _episode(log, settled, header, extra)
     except LogError as error:
-        raise _likelier(error, (*_better(read, log), *units)) from error
+        raise _likelier(error, (*_better(read, log), *units, *_late(log))) from error
     except ValueError as error:
         told = LogError(log.path, str(error).partition("; ")[0], "check --map and --origin")
-        raise _likelier(told, (*_better(read, log), *units)) from error
+        raise _likelier(told, (*_better(read, log), *units, *_late(log))) from error
     account += zeroed_in_contact(settled, stiffness)
     account += Account((finding,)) + _of_episode(episode, bool(conventions.doubts))
     episode = replace(episode, doubts=account.doubts)
@@ -190,6 +191,12 @@ def _unsettled(log: Log, choices: Importing) -> Readings | None:
 def _better(read: Readings | None, log: Log) -> tuple[Finding, ...]:
     """What is said of readings that fit much better."""
     return account_of(read, log).serious if read is not None and read.better else ()
+
+
+def _late(log: Log) -> tuple[Finding, ...]:
+    """Delays between the streams, which spoil the ends of holds and so what settles there."""
+    found = [e for e in log.findings if e.kind == "delay" and e.weight is Weight.DOUBT]
+    return tuple(replace(each, weight=Weight.SERIOUS) for each in found)
 
 
 def _likelier(error: LogError, doubts: tuple[Finding, ...]) -> LogError:
@@ -312,11 +319,17 @@ def _episode(
     commands, rows = settled.commands.copy(), settled.rows.copy()
     stiffness = np.array(header.stiffness)
     pressed = spring_wrench(settled, stiffness)[0]
+    begun = float(extra["time_s"][0])
+    lost = sum(time < begun for time in (*settled.broken, *settled.unsettled))
+    before = (
+        f"; {lost} holds before it make no row, for the arm still moved or samples are left out"
+    )
+    before = before if lost else ""
     if np.linalg.norm(pressed[:2]) > FREE_FORCE:
         raise LogError(
             log.path,
-            f"the first settled step (at {extra['time_s'][0]:.3g} s) is pressed by K (x - u) ="
-            f" ({pressed[0]:.2g}, {pressed[1]:.2g}) N, expected a free start",
+            f"the first settled step (at {begun:.3g} s) is pressed by K (x - u) ="
+            f" ({pressed[0]:.2g}, {pressed[1]:.2g}) N, expected a free start{before}",
             "begin with --start at a step without contact, and check --stiffness",
         )
     allowed = NOISE_FACTOR * np.array(header.sensor_std[3:]) + FREE_WRENCH
@@ -325,7 +338,7 @@ def _episode(
         raise LogError(
             log.path,
             f"the sensor reads ({read}) N, N, N·m at the free start, expected 0 within"
-            f" {', '.join(f'{value:.2g}' for value in allowed)}",
+            f" {', '.join(f'{value:.2g}' for value in allowed)}{before}",
             "subtract it with --tare, or begin elsewhere with --start",
         )
     away = rows[0, :3] - commands[0]

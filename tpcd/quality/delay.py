@@ -69,15 +69,14 @@ class Delay:
     value: float
     low: float
     high: float
-    """Two standard errors to either side."""
+    """Two standard errors to either side; infinite where either stream's is beyond `REACH`."""
     gain: float
     """Part of what most delays leave of the wrench that this one explains."""
 
     @property
     def known(self) -> bool:
         """Whether the data tell it."""
-        inside = abs(self.value) < REACH - 2 * STEPS[self.of]
-        return inside and self.high - self.low < 2 * WIDE and self.gain > CLEAR
+        return self.high - self.low < 2 * WIDE and self.gain > CLEAR
 
     @property
     def doubtful(self) -> bool:
@@ -127,8 +126,10 @@ def estimate_delays(streams: Sequence[Stream]) -> tuple[Delay, ...]:
     without = np.array([_lowest(each, lags) for each in left[1:]])
     error = np.sqrt((BLOCKS - 1) / BLOCKS * ((without - without.mean(0)) ** 2).sum(0))
     found, gain = [], 1.0 - float(left[0].min() / np.median(left[0]))
+    inside = all(abs(v) < REACH - 2 * s for v, s in zip(best, STEPS.values(), strict=True))
     for k, (of, step) in enumerate(STEPS.items()):
-        wide = 2 * float(np.hypot(error[k], step / np.sqrt(12.0)))
+        # Where one is beyond what is looked for, the other makes up for it.
+        wide = 2 * float(np.hypot(error[k], step / np.sqrt(12.0))) if inside else np.inf
         found.append(Delay(of, best[k], best[k] - wide, best[k] + wide, gain))
     return tuple(found)
 

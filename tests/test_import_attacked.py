@@ -68,3 +68,17 @@ def test_what_a_late_set_point_spoils_is_told_by_its_delay(tmp_path: Path, late:
         columns[name] = np.concatenate((columns[name][:1].repeat(count), columns[name][:-count]))
     with pytest.raises(LogError, match=r"the set point is 0\.\d+ s late .*--delay command=0\.\d"):
         imported(tmp_path / "run.csv", columns)
+
+
+@pytest.mark.parametrize("digits", ["single precision since 1970", "whole seconds"])
+def test_times_of_too_few_digits_are_named(tmp_path: Path, digits: str) -> None:
+    columns = table()
+    times = columns["t"]
+    coarse = (1.76e9 + times).astype(np.float32) if digits[1] == "i" else np.floor(times)
+    with pytest.raises(LogError, match="new at the time of the one before: the times have too few"):
+        imported(tmp_path / "run.csv", {**columns, "t": coarse.astype(np.float64)})
+
+
+def test_samples_that_are_written_ten_times_are_read_once(tmp_path: Path) -> None:
+    columns = {name: values.repeat(10) for name, values in table().items()}
+    assert len(imported(tmp_path / "run.csv", columns).settled.rows) > 10

@@ -207,6 +207,15 @@ def test_readings_finer_than_they_are_printed_have_the_noise_of_rounding() -> No
     assert found.noise[0] >= 0.01 / math.sqrt(12.0) - 1e-9
 
 
+def test_noise_over_several_steps_averages_rounding_out() -> None:
+    wrench = SAMPLES["wrench"].copy()
+    wrench[:, :2] = 0.4 * np.round(wrench[:, :2] / 0.4)
+    coarse = {**SAMPLES, "wrench": wrench}
+    found = find_settled(project(log_of(Setting(), coarse), Plane(), WrenchReading()), Stillness())
+    expected = math.hypot(0.2, 0.4 / math.sqrt(12.0)) / math.sqrt(WINDOW_SAMPLES)
+    assert np.allclose(found.noise[3:5] / expected, 1.0, atol=0.4)
+
+
 def test_motion_and_force_out_of_the_plane_are_said() -> None:
     log = log_of(Setting(), SAMPLES)
     wave = np.sin(log.times)

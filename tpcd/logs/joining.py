@@ -31,6 +31,8 @@ ROTATIONS: dict[RotationKind, tuple[str, ...]] = {
 }
 NO_TURN = 1e-3
 """A quaternion shorter than this is none: some senders fill with zeros."""
+COARSE = 0.85
+"""Of times that so many samples share with the one before nothing can be told."""
 DELAYS = ("pose", "wrench", "command")
 
 
@@ -73,6 +75,14 @@ def join(
     _check_overlap(path, list(parts.values()), [note for _, told in turns for note in told])
     fresh = forward(pose.times)
     again = int((np.diff(pose.times) == 0).sum())
+    fresher = (np.diff(pose.times) == 0) & (np.diff(pose.values, axis=0) != 0).any(1)
+    if fresher.sum() > COARSE * len(pose.times):
+        raise LogError(
+            path,
+            f"{int(fresher.sum())} of {len(pose.times)} samples are new at the time of the one"
+            " before: the times have too few digits",
+            "write them with more, or leave them out and give --rate in Hz",
+        )
     if again:
         notes.append(f"{again} samples repeat the time before and are left out")
     if int((~fresh).sum()) > again:
@@ -84,9 +94,13 @@ def join(
         values.update(zip(command.channels, _held(command, at, findings).T, strict=True))
     good = functools.reduce(np.logical_and, (np.isfinite(column) for column in values.values()))
     if good.sum() < 2:
+        held = ", ".join(
+            f"{name} in {int(np.isfinite([values[n] for n in part.channels]).all(0).sum())}"
+            for name, part in parts.items()
+        )
         raise LogError(
             path,
-            f"{int(good.sum())} of {len(at)} samples of the pose have all numbers",
+            f"{int(good.sum())} of {len(at)} samples of the pose have all numbers ({held})",
             "check the map or the topics, and what is missing",
         )
     if not good.all():

@@ -137,16 +137,32 @@ def _rows(
     broken: tuple[float, ...] = (),
 ) -> Settled:
     values = np.column_stack((log.poses, log.wrenches))
-    rows, squares = np.empty((len(stretches), 6)), np.zeros((len(stretches), 6))
+    rows, squares, scatter = (np.zeros((len(stretches), 6)) for _ in range(3))
     for k, (first, end) in enumerate(stretches):
         part = values[first:end]
-        rows[k] = part.mean(0)
+        rows[k], scatter[k] = part.mean(0), part.var(0)
         means = np.stack([block.mean(0) for block in np.array_split(part, BLOCKS)])
         squares[k] = means.var(0, ddof=1) / BLOCKS
     held = None
     if commands is not None:
         held = np.stack([commands[end - 1] for _, end in stretches]) if len(stretches) else rows
         held = held[:, :3]
-    least = np.array([resolution(column) for column in values.T]) / np.sqrt(12.0)
-    noise = np.maximum(np.sqrt(squares.mean(0)), least) if len(rows) else np.full(6, np.nan)
+    if not len(rows):
+        noise = np.full(6, np.nan)
+    else:
+        steps = np.array([resolution(column) for column in values.T])
+        noise = np.maximum(np.sqrt(squares.mean(0)), _rounding(steps, scatter.mean(0)))
     return Settled(stretches, rows, held, noise, unsettled, brief, broken)
+
+
+def _rounding(
+    steps: Float[np.ndarray, " 6"], variance: Float[np.ndarray, " 6"]
+) -> Float[np.ndarray, " 6"]:
+    """What rounding to steps leaves in the mean of many samples that have some variance.
+
+    Noise carries samples over several steps, and so their mean to between the steps (dither;
+    Gray and Stockham, "Dithered quantizers", IEEE Transactions on Information Theory 39, 1993).
+    """
+    noise = np.maximum(variance - steps**2 / 12.0, 0.0)
+    across = np.divide(noise, steps**2, out=np.zeros_like(noise), where=steps > 0)
+    return steps / np.sqrt(12.0) * np.exp(-2.0 * np.pi**2 * across)

@@ -82,3 +82,21 @@ def test_times_of_too_few_digits_are_named(tmp_path: Path, digits: str) -> None:
 def test_samples_that_are_written_ten_times_are_read_once(tmp_path: Path) -> None:
     columns = {name: values.repeat(10) for name, values in table().items()}
     assert len(imported(tmp_path / "run.csv", columns).settled.rows) > 10
+
+
+def test_samples_that_are_mostly_right_are_told_from_their_mean(tmp_path: Path) -> None:
+    columns = table()
+    struck = np.random.default_rng(4).random(len(columns["t"])) < 0.2
+    columns["w_2"] = np.where(struck, columns["w_2"] + 10.0, columns["w_2"])
+    doubts = imported(tmp_path / "run.csv", columns).account.doubts
+    assert any(each.kind == "spikes" and "F_z in" in each.sentence for each in doubts)
+
+
+@pytest.mark.parametrize(("column", "name"), [("w_0", "F_x"), ("w_4", "tau")])
+def test_a_channel_that_was_not_recorded_is_no_other_convention(
+    tmp_path: Path, column: str, name: str
+) -> None:
+    columns = table()
+    columns[column] = np.zeros(len(columns["t"]))
+    serious = imported(tmp_path / "run.csv", columns).account.serious
+    assert [each.kind for each in serious] == ["dead"] and name in serious[0].sentence

@@ -157,6 +157,18 @@ def test_a_late_wrench_is_told_its_lag() -> None:
     assert holds(quantity(told, "wrench_lag"), late / 50.0)
 
 
+@pytest.mark.parametrize("samples", [2, 5])
+def test_a_late_wrench_does_not_hide_the_friction(samples: int) -> None:
+    arm, hit = Arm(), 0
+    for seed in range(3):
+        log = moving(arm, seed, SECONDS)
+        forces, torques = (np.roll(v, samples, axis=0) for v in (log.forces, log.torques))
+        told = identify(replace(log, forces=forces, torques=torques))
+        for axis, value in zip(AXES, arm.friction[:3], strict=True):
+            hit += holds(quantity(told, f"arm_friction_{axis}"), value)
+    assert hit >= 8
+
+
 @pytest.mark.parametrize("count", [2, 3, 5, 12, 60])
 def test_too_few_samples_tell_nothing_and_break_nothing(count) -> None:
     log = moving(Arm(), 8, 10.0)

@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from tpcd.data.header import SENSOR_NAMES
 from tpcd.logs.hypotheses import BEYOND_NOISE, LEAST_TURN, MISSED, WITHIN, Reading
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog
 from tpcd.logs.readings import Readings, same_episode
-from tpcd.logs.settled import Settled
+from tpcd.logs.settled import Settled, Stillness
 from tpcd.quality.finding import Finding, Weight, usable
 
 OUT_OF_PLANE_MOTION = 0.1
@@ -40,6 +41,7 @@ SURE = 5.0
 """Standard errors from which a cause is told: by chance in one of a thousand recordings."""
 LARGE = 0.1
 """Part of the load of a channel below which it is arms and sensors as they are."""
+SENSOR_UNITS = ("m", "m", "rad", "N", "N", "N·m")
 CHANNELS, UNITS = ("F_x", "F_z", "tau"), ("N", "N", "N·m")
 
 
@@ -157,6 +159,43 @@ def account_of(read: Readings | None, log: Log) -> Account:
         remedy = "look whether phi grows as the hand turns from x to z; else --invert_rotation"
         return account + Account((), (doubt("mirrored", told, f"{remedy} --invert_torque"),))
     return account
+
+
+def spiked(settled: Settled, stillness: Stillness) -> Account:
+    """Rows whose mean is not what most of their samples read."""
+    if settled.off_median is None:
+        return Account()
+    far = settled.off_median > stillness.channels / 2.0
+    told = [
+        f"{SENSOR_NAMES[k]} in {int(far[:, k].sum())} of {len(far)} rows, by up to"
+        f" {settled.off_median[:, k].max():.2g} {SENSOR_UNITS[k]}"
+        for k in np.flatnonzero(far.any(0))
+    ]
+    if not told:
+        return Account()
+    sentence = (
+        "the mean of the samples is not what most of them read, as where single ones are spikes or"
+        f" filled in: {', '.join(told)}"
+    )
+    return Account((), (doubt("spikes", sentence, "look at the sensor's cable and driver"),))
+
+
+def dead_channels(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Account | None:
+    """Forces and torque that read one number in all rows, though the springs pull differently."""
+    if settled.commands is None or len(settled.rows) < 2:
+        return None
+    spring = np.ptp(spring_wrench(settled, stiffness), axis=0)
+    least = np.array([1.0, 1.0, 0.05])
+    dead = np.flatnonzero((np.ptp(settled.rows[:, 3:], axis=0) == 0) & (spring > least))
+    if not len(dead):
+        return None
+    told = "; ".join(
+        f"{CHANNELS[k]} reads {settled.rows[0, 3 + k]:.4g} in all {len(settled.rows)} rows, where"
+        f" K (x - u) changes by {spring[k]:.2g} {UNITS[k]}"
+        for k in dead
+    )
+    remedy = "map the columns that hold it, or measure again"
+    return Account((), (doubt("dead", f"{told}: not recorded", remedy, serious=True),))
 
 
 def zeroed_in_contact(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Account:

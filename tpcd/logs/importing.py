@@ -27,8 +27,10 @@ from tpcd.logs.conventions import RotationReading
 from tpcd.logs.findings import (
     Account,
     account_of,
+    dead_channels,
     doubt,
     left_out,
+    spiked,
     spring_wrench,
     turned_out,
     zeroed_in_contact,
@@ -119,6 +121,10 @@ def import_log(log: Log, choices: Importing) -> Imported:
     account += left_out(planar)
     if read is None or not read.in_plane_otherwise:
         account += turned_out(log.path, planar)
+    account += spiked(settled, choices.stillness)
+    if dead := dead_channels(settled, stiffness):
+        # What is not felt says nothing of conventions, and other points or axes would fit it.
+        conventions = dead
     account += conventions
     restless = _restless(settled, choices.stillness)
     std = choices.sensor_std

@@ -62,6 +62,9 @@ class Settled:
     """Holds too short for a row, or with too few samples in it."""
     broken: tuple[float, ...] = ()
     """Times at which stretches ended that findings leave out, in whole or in part [s]."""
+    off_median: Float[np.ndarray, "k 6"] | None = None
+    """By how much the mean of a row lies further from the median of its samples than their noise,
+    steps or drift take it, as spikes do; None where the arm may have moved."""
 
 
 def find_settled(log: PlanarLog, stillness: Stillness) -> Settled:
@@ -137,10 +140,12 @@ def _rows(
     broken: tuple[float, ...] = (),
 ) -> Settled:
     values = np.column_stack((log.poses, log.wrenches))
-    rows, squares, scatter = (np.zeros((len(stretches), 6)) for _ in range(3))
+    rows, squares, scatter, off = (np.zeros((len(stretches), 6)) for _ in range(4))
     for k, (first, end) in enumerate(stretches):
         part = values[first:end]
         rows[k], scatter[k] = part.mean(0), part.var(0)
+        median = np.median(part, axis=0)
+        off[k] = np.abs(rows[k] - median) - np.median(np.abs(part - median), axis=0)
         means = np.stack([block.mean(0) for block in np.array_split(part, BLOCKS)])
         squares[k] = means.var(0, ddof=1) / BLOCKS
     held = None
@@ -148,11 +153,11 @@ def _rows(
         held = np.stack([commands[end - 1] for _, end in stretches]) if len(stretches) else rows
         held = held[:, :3]
     if not len(rows):
-        noise = np.full(6, np.nan)
-    else:
-        steps = np.array([resolution(column) for column in values.T])
-        noise = np.maximum(np.sqrt(squares.mean(0)), _rounding(steps, scatter.mean(0)))
-    return Settled(stretches, rows, held, noise, unsettled, brief, broken)
+        return Settled(stretches, rows, held, np.full(6, np.nan), unsettled, brief, broken)
+    steps = np.array([resolution(column) for column in values.T])
+    noise = np.maximum(np.sqrt(squares.mean(0)), _rounding(steps, scatter.mean(0)))
+    off = None if held is None else np.where(off > steps, off, 0.0)
+    return Settled(stretches, rows, held, noise, unsettled, brief, broken, off)
 
 
 def _rounding(

@@ -49,14 +49,48 @@ def identify(log: Log, stiffness: Sequence[float] | None = None) -> tuple[Quanti
     parity, told = impedance(sampled, stiffness)
     if computed(parity):
         return told
+    if (late := _late(told)) is not None:
+        # What comes late turns round late, as friction does.
+        log = _earlier(log, late)
+        sampled = springs(log)
+        assert sampled is not None
+        parity, again = impedance(sampled, stiffness)
+        told = _with_lag(again, told)
     load = _from_parity(parity, stiffness)
     turn = _sensor_turn(load)
     if turn is not None:
         # A turned sensor reads less than the whole force along an axis, by the square of the turn.
         straight = springs(_unturned(log, parity.frame, turn))
         assert straight is not None
-        _, told = impedance(straight, stiffness)
+        _, again = impedance(straight, stiffness)
+        told = again if late is None else _with_lag(again, told)
     return (*told, *load)
+
+
+def _late(told: Sequence[Quantity]) -> float | None:
+    """By how much the wrench is late, where that is told apart from none [s]; damping of the arm
+    looks like one that is early."""
+    lag = quantity(told, "wrench_lag")
+    if lag.interval is None or not isinstance(lag.value, float) or lag.interval[0] <= 0.0:
+        return None
+    return lag.value
+
+
+def _earlier(log: Log, by: float) -> Log:
+    """The recording with the wrench taken earlier [s], where it is there."""
+    kept = log.only(log.times + by <= log.times[-1])
+
+    def moved(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+        columns = [np.interp(kept.times + by, log.times, column) for column in values.T]
+        return np.stack(columns, axis=1)
+
+    return replace(kept, forces=moved(log.forces), torques=moved(log.torques))
+
+
+def _with_lag(again: Sequence[Quantity], before: Sequence[Quantity]) -> tuple[Quantity, ...]:
+    """What is told once a lag is taken away, and the lag."""
+    lag = quantity(before, "wrench_lag")
+    return tuple(lag if each.name == "wrench_lag" else each for each in again)
 
 
 def _sensor_turn(load: Sequence[Quantity]) -> Rotation | None:

@@ -122,9 +122,9 @@ def import_log(log: Log, choices: Importing) -> Imported:
     if read is None or not read.in_plane_otherwise:
         account += turned_out(log.path, planar)
     account += spiked(settled, choices.stillness)
-    if dead := dead_channels(settled, stiffness):
-        # What is not felt says nothing of conventions, and other points or axes would fit it.
-        conventions = dead
+    if not read or not read.exchanged:
+        # What is not felt says nothing of conventions, and another point might fit it.
+        conventions = dead_channels(settled, stiffness) or conventions
     account += conventions
     restless = _restless(settled, choices.stillness)
     std = choices.sensor_std

@@ -46,6 +46,12 @@ class Readings:
         """Whether what fits better has the rotation in the plane."""
         return any(each.left.get("rotation", 0.0) <= MISSED for each in self.better[:1])
 
+    @property
+    def exchanged(self) -> bool:
+        """Whether what fits better reads other numbers, and not only another point or size."""
+        subjects = {change.subject for each in self.better[:1] for change in each.changes}
+        return bool(subjects - {"point", "factor"})
+
 
 def at_rest(log: Log, settled: Settled) -> Log:
     """One sample for each settled stretch: means, and the rotation nearest to the mean one."""

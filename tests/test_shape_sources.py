@@ -102,9 +102,13 @@ def test_the_unit_of_a_header_is_taken_unless_another_is_given(tmp_path):
         ("x,z\nmm,mm", 1000),
         ('"x","z"\n"[in]","[in]"', 1 / 0.0254),
         ("x [inch],z [inch]", 1 / 0.0254),
+        ("x [centimeters];z [centimeters]", 100),
+        ("x in millimetres,z in millimetres", 1000),
+        ("x (meter),z (meter)", 1),
         ("# unit: mm\nx,z", 1000),
         ("# a plate, cut from 3 mm steel\nx,z", 1),
         ("width in front,height in front", 1),
+        ("left foot,right foot", 1),
     ],
 )
 def test_a_header_names_its_unit_in_many_ways(tmp_path, header, scale):
@@ -141,6 +145,8 @@ def test_a_csv_in_millimetres_without_saying_so_gets_the_hint(tmp_path):
         ("z,x\n0,0\n0.1,0\n0.1,0.1\n", "line 1 begins with z"),
         ("x [mm],z [cm]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in cm and mm"),
         ("x [ft],z [ft]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in ft"),
+        ("x [feet],z [feet]\n0,0\n0.1,0\n0.1,0.1\n", "its header is in feet"),
+        ("x in decimetres,z\n0,0\n0.1,0\n0.1,0.1\n", "its header is in decimetres"),
         ("0,0\n0.1,0\n0.1,0.1\n\n0.2,0\n0.3,0\n0.3,0.1\n", "line 4 is empty and parts"),
         ("0,0\n0.1\n0.1,0.1\n", "line 2 has 1 numbers"),
         ("0,0\n0.1,nan\n0.1,0.1\n", "line 2 is '0.1,nan'"),

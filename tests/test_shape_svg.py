@@ -165,6 +165,9 @@ def test_a_path_in_millimetres_becomes_metres_with_z_up(tmp_path):
         ('<rect width="100" height="40" ry="500"/>', (0.1, 0.04), np.pi * 0.05 * 0.02),
         ('<circle cx="50" cy="50" r="30"/>', (0.06, 0.06), np.pi * 9e-4),
         ('<ellipse cx="50" cy="50" rx="40" ry="20"/>', (0.08, 0.04), np.pi * 8e-4),
+        ('<ellipse cx="50" cy="50" rx="40"/>', (0.08, 0.08), np.pi * 16e-4),
+        ('<ellipse cx="50" cy="50" ry="40" rx="auto"/>', (0.08, 0.08), np.pi * 16e-4),
+        ('<switch><rect display="none"/><g><circle r="5"/></g></switch>', (0.01, 0.01), None),
         ('<polygon points="0,0 100,0 100,50"/>', (0.1, 0.05), 0.0025),
         ('<polyline points="0 0 100 0 100 50"/>', (0.1, 0.05), 0.0025),
         ('<path d="M20 50A30 30 0 1 1 80 50A30 30 0 1 1 20 50"/>', (0.06, 0.06), np.pi * 9e-4),
@@ -323,6 +326,12 @@ def test_pixels_of_other_programs_are_not_those_of_css(tmp_path):
     assert single(tmp_path, body, whole).area == pytest.approx(0.0054, rel=1e-5)
 
 
+def test_a_radius_in_percent_that_stands_alone_counts_for_both(tmp_path):
+    wide = 'width="200mm" height="100mm" viewBox="0 0 200 100"'
+    for body in ('<ellipse rx="20%"/>', '<ellipse ry="40%"/>'):
+        assert single(tmp_path, body, wide).size == pytest.approx((0.08, 0.08), rel=1e-3)
+
+
 def test_lengths_with_units_keep_them_or_are_refused(tmp_path):
     path = drawing(tmp_path, '<rect width="60mm" height="9cm"/>', "")
     assert "width='60mm' has a unit of its own; give --unit px" in refusal(path, unit="mm")
@@ -383,6 +392,11 @@ def test_the_unit_comes_from_the_caller_or_from_the_root(tmp_path, root, unit, w
         ('<rect width="-60" height="9"/>', MM, "width='-60' is negative"),
         ('<circle r="5" transform="scale(200%)"/>', MM, "'200%' holds '%'"),
         ('<use href="#a"/>', MM, "clone"),
+        (
+            '<switch><circle r="5"/><g><rect width="9" height="9"/></g></switch>',
+            MM,
+            "a <switch> holds",
+        ),
         ('<circle r="half"/>', MM, "r='half' is no length"),
         ('<circle r="5" transform="wobble(3)"/>', MM, "transform 'wobble'"),
         ('<circle r="5" transform="scale 3"/>', MM, "is malformed"),

@@ -24,11 +24,14 @@ from tpcd.text import encoding_of, lines_of, read_text
 SEPARATOR = re.compile(r"[,;\t ]+")
 WIDE_SEPARATOR = re.compile(r"[;\t ]+")
 QUOTED = re.compile(r"""(["'])(.*?)\1""")
-UNITS = r"(m|cm|mm|in|inch|inches|dm|ft|um|\u00b5m|px|pt)"
+SPELLED = r"(?:milli|centi|deci|micro|nano)?met(?:re|er)s?|inch(?:es)?"
+UNITS = rf"(m|cm|mm|in|dm|ft|foot|feet|yd|yards?|mils?|um|nm|\u00b5m|px|pt|{SPELLED})"
 HEADER_UNIT = re.compile(
-    rf"[\[(_/]\s*{UNITS}(?![a-z])|(?:^|[,;\t])\s*{UNITS}\s*(?=$|[,;\t])|\b(cm|mm|inch|inches)\b"
+    rf"[\[(_/]\s*{UNITS}(?![a-z])|(?:^|[,;\t])\s*{UNITS}\s*(?=$|[,;\t])|\b(cm|mm|{SPELLED})\b"
 )
 """A unit in brackets, after a line or a stroke, alone in its cell, or one that is no word."""
+SPELLED_UNIT = {"m": "met", "cm": "centimet", "mm": "millimet", "in": "in"}
+"""How the names of the units begin that are taken."""
 COMMENT_UNIT = re.compile(rf"\bunits?\s*[:=]?\s*{UNITS}\b")
 
 
@@ -189,4 +192,7 @@ def _fields(line: str) -> list[str]:
 def _units(pattern: re.Pattern[str], text: str) -> set[str]:
     """The units that a text names."""
     names = {name for found in pattern.finditer(text.lower()) for name in found.groups() if name}
-    return {"in" if name.startswith("in") else name for name in names}
+    short = {
+        name: u for name in names for u, start in SPELLED_UNIT.items() if name.startswith(start)
+    }
+    return {short.get(name, name) for name in names}

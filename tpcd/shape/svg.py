@@ -272,8 +272,11 @@ def _shapes(
         if moved:
             yield element.get("id", ""), moved
         return
-    for child in element:
-        yield from _shapes(child, matrix, around, visibility)
+    drawn = [list(_shapes(child, matrix, around, visibility)) for child in element]
+    if tag == "switch" and sum(map(bool, drawn)) > 1:
+        raise ValueError("a <switch> holds shapes to choose from; leave those that are meant")
+    for shapes in drawn:
+        yield from shapes
 
 
 def _subpaths(
@@ -298,12 +301,12 @@ def _subpaths(
         radius = length_of(element, "r", diagonal)
         radii = (radius, radius)
     else:
-        alone = {"rx": said(element, "ry", "0"), "ry": said(element, "rx", "0")}
-        alone = {key: "0" if value == "auto" else value for key, value in alone.items()}
-        radii = (
-            length_of(element, "rx", width, alone["rx"]),
-            length_of(element, "ry", height, alone["ry"]),
+        rx, ry = (
+            None if said(element, key, "auto") == "auto" else length_of(element, key, whole)
+            for key, whole in (("rx", width), ("ry", height))
         )
+        # One alone counts for both, once it is in user units.
+        radii = ((ry or 0.0) if rx is None else rx, (rx or 0.0) if ry is None else ry)
     if tag == "rect":
         place = (length_of(element, "x", width), length_of(element, "y", height))
         size = (length_of(element, "width", width), length_of(element, "height", height))

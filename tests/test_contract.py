@@ -11,11 +11,12 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from contact_scenes import STIFFNESS, make_scene, vector
+from contact_scenes import BOX, STIFFNESS, make_scene, vector
 
 from eval.blind.suites import MEDIUM, OUTSIDE
 from tpcd.belief.belief import Belief, estimate
 from tpcd.belief.settings import EstimatorSettings, SamplerSettings
+from tpcd.contact import ContactScene
 from tpcd.contract import as_numbers, check_effect, check_stiffness
 from tpcd.data import Episode, read_episode, write_episode
 from tpcd.effects.catalogue import KNOWN, unit_of
@@ -25,6 +26,7 @@ from tpcd.qp import ContactQP, solve
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepStatus, rollout, simulate_step
+from tpcd.terrain import HalfPlane
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -269,3 +271,56 @@ def test_effects_of_any_likely_size_are_taken_and_those_in_another_unit_refused(
     ):
         with pytest.raises(ValueError, match=f"{name}.{parameter} is .*, expected"):
             check_effect(name, parameter, value, unit_of(name, parameter))
+
+
+def test_a_scene_takes_lists_and_arrays_and_what_broadcasts():
+    wanted = simulate_step(make_scene(), POSE, COMMAND, STIFFNESS)
+    for points, friction in ((BOX.tolist(), [0.4, 0.4]), (BOX.numpy(), np.full((3, 2), 0.4))):
+        scene = ContactScene(points, make_scene().terrains, friction)
+        for engine in ("native", "torch"):
+            found = simulate_step(scene, POSE, COMMAND, STIFFNESS, engine=engine)
+            torch.testing.assert_close(found.pose, wanted.pose.expand_as(found.pose))
+    several = make_scene(position=[0.3, 0.05, 0.02])
+    scene = ContactScene(BOX, several.terrains, [0.4, 0.4])
+    found = simulate_step(scene, POSE, COMMAND, STIFFNESS, engine="torch")
+    torch.testing.assert_close(found.pose, simulate_step(several, POSE, COMMAND, STIFFNESS).pose)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "told"),
+    [
+        ({"points_ee": torch.zeros(4, 3)}, ValueError, "points_ee has shape (4, 3), expected 2"),
+        ({"points_ee": BOX.mT}, ValueError, "points_ee has shape (2, 4), expected 2 numbers"),
+        ({"points_ee": BOX[:0]}, ValueError, "points_ee has shape (0, 2) against 2 terrains"),
+        ({"points_ee": "mug"}, TypeError, "points_ee is str, expected 2 numbers"),
+        ({"friction": vector(0.4)}, ValueError, "friction has shape (1,), expected 2 numbers"),
+        ({"compliance": vector(1e-4)}, ValueError, "compliance has shape (1,), expected 2 numbers"),
+        ({"terrains": ()}, ValueError, "against 0 terrains"),
+        ({"points_ee": BOX.expand(3, 4, 2), "friction": torch.full((2, 2), 0.4)}, ValueError,
+         "batch axes are points_ee (3,), friction (2,), compliance (2,), expected axes that broad"),
+    ],
+)  # fmt: skip
+def test_what_is_no_scene_is_refused_in_one_line(change, kind, told):
+    scene = make_scene()
+    with pytest.raises(kind) as raised:
+        ContactScene(**{**vars(scene), "compliance": None, **change})
+    assert told in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("engine", ["native", "torch"])
+@pytest.mark.parametrize("length", [0.0, 0.5, 2.0])
+def test_a_terrain_whose_direction_is_no_unit_vector_has_no_answer(engine, length):
+    terrains = HalfPlane(vector(0, length), vector(0.0)[0]), make_scene().terrains[1]
+    scene = ContactScene(BOX, terrains, [0.4, 0.4])
+    found = simulate_step(scene, POSE, COMMAND, STIFFNESS, engine=engine)
+    assert int(found.status) == StepStatus.INVALID_INPUT and found.pose.isnan().all()
+    rounded = replace(scene, terrains=(HalfPlane(vector(0.001, 1.0), vector(0.0)[0]), terrains[1]))
+    found = simulate_step(rounded, POSE, COMMAND, STIFFNESS, engine=engine)
+    assert int(found.status) == StepStatus.CONVERGED
+
+
+def test_an_outline_in_millimetres_is_refused_unless_the_caller_insists():
+    scene = make_scene(1e3 * BOX)
+    with pytest.raises(ValueError, match="points_ee reaches .*millimetres.*unusual=True"):
+        simulate_step(scene, POSE, COMMAND, STIFFNESS)
+    simulate_step(scene, POSE, COMMAND, STIFFNESS, unusual=True)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tpcd.contract import as_numbers, one_batch
 from tpcd.parameters import Parameters
 from tpcd.planar import perpendicular, rotate, transform_points
 from tpcd.shape.protocol import Shape
@@ -27,8 +28,8 @@ class ContactScene:
     `points_ee` are outline points in the end-effector frame [m], `terrains` the t bodies of
     the world, `friction` the Coulomb coefficient of the object against each of them, and
     `compliance` [m/N] how far each yields along its normal, as a spring; 0, and where it is left
-    out, for what is rigid. All carry the same leading batch axes, but those of the outlines may be
-    of length 1.
+    out, for what is rigid. Batch axes in front are broadcast, but those of the outlines may stay of
+    length 1. Arrays and lists are taken for tensors; TypeError and ValueError for other shapes.
     """
 
     points_ee: Float[Tensor, "*#batch p 2"]
@@ -37,9 +38,31 @@ class ContactScene:
     compliance: Float[Tensor, "*batch t"] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Make all terrains rigid where nothing else is said."""
-        if self.compliance is None:
-            object.__setattr__(self, "compliance", torch.zeros_like(self.friction))
+        """Bring all to one batch, and make terrains rigid where nothing else is said."""
+        points, count = as_numbers("points_ee", self.points_ee, 2), len(self.terrains)
+        if points.ndim < 2 or 0 in (points.shape[-2], count):
+            told = f"points_ee has shape {tuple(points.shape)} against {count} terrains"
+            raise ValueError(f"{told}, expected rows of 2 numbers, and of each at least one")
+        friction = as_numbers("friction", self.friction, count, device=points.device)
+        compliance = torch.zeros_like(friction) if self.compliance is None else self.compliance
+        compliance = as_numbers("compliance", compliance, count, device=points.device)
+        shapes = {
+            "points_ee": points.shape[:-2],
+            "friction": friction.shape[:-1],
+            "compliance": compliance.shape[:-1],
+        }
+        for t, body in enumerate(self.terrains):
+            if isinstance(body, HalfPlane):
+                shapes[f"direction of terrain {t}"] = body.direction.shape[:-1]
+                shapes[f"offset of terrain {t}"] = body.offset.shape
+        batch = one_batch(shapes)
+        terrains = tuple(
+            body.expand(batch) if isinstance(body, HalfPlane) else body for body in self.terrains
+        )
+        object.__setattr__(self, "points_ee", points)
+        object.__setattr__(self, "terrains", terrains)
+        object.__setattr__(self, "friction", friction.expand(*batch, count))
+        object.__setattr__(self, "compliance", compliance.expand(*batch, count))
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -78,8 +101,7 @@ class ContactScene:
             assert isinstance(body, HalfPlane)
             offset = body.offset - more
             planes.append(HalfPlane(body.direction.expand(*offset.shape, 2), offset))
-        more = (self.friction.expand(gap.shape), self.compliance.expand(gap.shape))
-        return ContactScene(self.points_ee, tuple(planes), *more)
+        return ContactScene(self.points_ee, tuple(planes), self.friction, self.compliance)
 
     def columns(self, index: Int[Tensor, " n"]) -> ContactScene:
         """The scenes at positions `index` of the last batch axis, where it has more than one."""

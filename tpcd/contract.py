@@ -72,6 +72,15 @@ def as_numbers(
     return found if found.is_floating_point() else found.double()
 
 
+def one_batch(shapes: dict[str, torch.Size]) -> torch.Size:
+    """The batch that named leading axes broadcast to. Raises ValueError."""
+    try:
+        return torch.broadcast_shapes(*shapes.values())
+    except RuntimeError as error:
+        told = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items() if shape)
+        raise ValueError(f"batch axes are {told}, expected axes that broadcast") from error
+
+
 def check_finite(name: str, value: Float[Tensor, "*batch n"]) -> None:
     """Refuse a NaN or an infinity; names the row. Raises ValueError."""
     bad = ~torch.isfinite(value)
@@ -81,21 +90,28 @@ def check_finite(name: str, value: Float[Tensor, "*batch n"]) -> None:
         raise ValueError(f"{name} is {float(value[tuple(place)])}{where}, expected a finite number")
 
 
+def check_lengths(name: str, value: Float[Tensor, "*values"], unusual: bool = False) -> None:
+    """Refuse lengths that are no metres; ValueError."""
+    _check_largest(name, value, LARGEST_LENGTH, "m", "millimetres", unusual)
+
+
 def check_pose(name: str, value: Float[Tensor, "*batch 3"], unusual: bool = False) -> None:
     """Refuse poses or commands (x, z, angle) that are no metres and radians; ValueError."""
+    check_lengths(name, value[..., :2], unusual)
+    _check_largest(name, value[..., 2], LARGEST_ANGLE, "rad", COUNTED, unusual)
+
+
+def _check_largest(
+    name: str, value: Tensor, limit: float, unit: str, likely: str, unusual: bool
+) -> None:
     if unusual or value.numel() == 0:
         return
-    with torch.no_grad():
-        largest = value.abs().reshape(-1, 3).nan_to_num(0.0, 0.0, 0.0).amax(0).tolist()
-    for reached, limit, unit, likely in (
-        (max(largest[:2]), LARGEST_LENGTH, "m", "millimetres"),
-        (largest[2], LARGEST_ANGLE, "rad", COUNTED),
-    ):
-        if reached > limit:
-            raise ValueError(
-                f"{name} reaches {reached:g}, expected {unit} (at most {limit:.3g}): it looks like"
-                f" {likely}; convert it, {INSIST}"
-            )
+    reached = float(value.detach().abs().nan_to_num(0.0, 0.0, 0.0).max())
+    if reached > limit:
+        raise ValueError(
+            f"{name} reaches {reached:g}, expected {unit} (at most {limit:.3g}): it looks like"
+            f" {likely}; convert it, {INSIST}"
+        )
 
 
 def check_effect(name: str, parameter: str, value: float, unit: str) -> None:

@@ -14,6 +14,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+OFF_UNIT = 2e-3
+"""What the square of a direction's length may differ from 1, as of one rounded to three digits."""
+
 
 @runtime_checkable
 class Terrain(Protocol):
@@ -58,6 +61,10 @@ class HalfPlane:
     def double(self) -> HalfPlane:
         """The same half-planes in float64."""
         return HalfPlane(self.direction.double(), self.offset.double())
+
+    def expand(self, batch: torch.Size) -> HalfPlane:
+        """The same half-planes for a larger batch."""
+        return HalfPlane(self.direction.expand(*batch, 2), self.offset.expand(batch))
 
     def gather(self, index: Int[Tensor, "*batch"]) -> HalfPlane:
         """The half-planes at positions `index` of the flattened batch."""

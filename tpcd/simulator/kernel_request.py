@@ -12,6 +12,7 @@ from tpcd.simulator.kernel_geometry import build_chains
 from tpcd.simulator.kernel_inner import inner
 from tpcd.simulator.kernel_space import Law
 from tpcd.simulator.settle import PROBE_ANGLE
+from tpcd.terrain import OFF_UNIT
 
 
 class Request(NamedTuple):
@@ -114,13 +115,15 @@ def _reach(world, o):
 @inner
 @no_type_check
 def sound(world, o, law):
-    """Whether planes and stiffness are finite, friction within bounds and stiffness positive."""
+    """Whether planes and stiffness are finite, directions of length 1, friction within bounds and
+    stiffness positive."""
     total = 0.0
     for t in range(world.normals.shape[1]):
         rough = world.friction[o, t]
         total += abs(world.offsets[o, t]) + (0.0 if 0.0 <= rough <= LARGEST_FRICTION else np.inf)
         total += world.compliance[o, t] if world.compliance[o, t] >= 0.0 else np.inf
-        total += abs(world.normals[o, t, 0]) + abs(world.normals[o, t, 1])
+        square = world.normals[o, t, 0] ** 2 + world.normals[o, t, 1] ** 2
+        total += 0.0 if abs(square - 1.0) <= OFF_UNIT else np.inf
     for a in range(3):
         total += law.root[a] if law.stiffness[a] > 0.0 else np.inf
     return math.isfinite(total)

@@ -182,12 +182,12 @@ def world_of(scene: ContactScene) -> World:
     """The scenes of a flat batch against half-planes, as the compiled loops read them."""
     from tpcd.simulator.kernel_geometry import World
 
-    terrains, batch = len(scene.terrains), scene.batch_shape
+    terrains = len(scene.terrains)
     planes = [body for body in scene.terrains if isinstance(body, HalfPlane)]
     points = scene.points_ee.detach().double()
     points = points.reshape(-1, *points.shape[-2:]).mT.contiguous()
-    normals = torch.stack([p.direction.detach().expand(*batch, 2) for p in planes], -2)
-    offsets = torch.stack([p.offset.detach().expand(batch) for p in planes], -1)
+    normals = torch.stack([p.direction.detach() for p in planes], -2)
+    offsets = torch.stack([p.offset.detach() for p in planes], -1)
     return World(
         points.numpy(),
         _flat(normals, terrains, 2),

@@ -48,8 +48,9 @@ class StepStatus(IntEnum):
     RELAXED = 3, "jammed: no motion satisfies contact with friction; answered without friction"
     INVALID_INPUT = (
         4,
-        "the pose, command or scene holds a NaN or an infinity, or a friction that is not from 0 to"
-        f" {LARGEST_FRICTION:g}",
+        "the pose, command or scene holds a NaN or an infinity, a friction that is not from 0 to"
+        f" {LARGEST_FRICTION:g}, a compliance below 0, or a terrain whose direction is not of"
+        " length 1",
     )
 
     sentence: str

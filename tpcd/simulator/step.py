@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.contact import ContactScene
-from tpcd.contract import as_numbers, check_pose, check_stiffness
+from tpcd.contract import as_numbers, check_lengths, check_pose, check_stiffness, one_batch
 from tpcd.parameters import LARGEST_FRICTION
 from tpcd.simulator import native
 from tpcd.simulator.lowest import lowest_points
@@ -26,7 +26,7 @@ from tpcd.simulator.record import (
     Transition,
 )
 from tpcd.simulator.settle import own
-from tpcd.terrain import HalfPlane
+from tpcd.terrain import OFF_UNIT, HalfPlane
 
 Engine = Literal["auto", "torch", "native"]
 DEFAULT_SETTINGS = StepSettings()
@@ -64,11 +64,14 @@ def simulate_step(
     check_stiffness(stiffness, unusual)
     check_pose("pose", pose, unusual)
     check_pose("command", command, unusual)
+    check_lengths("points_ee", scene.points_ee, unusual)
     if previous is not None:
         previous = as_numbers("previous", previous, 3, device=device)
         check_pose("previous", previous, unusual)
     given = (pose, command, stiffness) if previous is None else (pose, command, stiffness, previous)
-    batch = torch.broadcast_shapes(scene.batch_shape, *(one.shape[:-1] for one in given))
+    names = ("pose", "command", "stiffness", "previous")
+    shapes = {name: one.shape[:-1] for name, one in zip(names, given, strict=False)}
+    batch = one_batch({"scene": scene.batch_shape, **shapes})
     if stiffness.ndim > 1:
         stiffness = stiffness.expand(*batch, 3).reshape(-1, 3)
     pose = pose.expand(*batch, 3).reshape(-1, 3)
@@ -229,6 +232,9 @@ def _step_finite(
         for value in given:
             finite = finite & torch.isfinite(value).all(-1)
         finite = finite & ((scene.compliance >= 0) & (scene.compliance < torch.inf)).all(-1)
+        for body in scene.terrains:
+            if isinstance(body, HalfPlane):
+                finite = finite & ((body.direction.square().sum(-1) - 1).abs() <= OFF_UNIT)
         finite = finite & ((scene.friction >= 0) & (scene.friction <= LARGEST_FRICTION)).all(-1)
     if bool(finite.all()):
         return follow_path(scene, start, previous, command, stiffness, settings)

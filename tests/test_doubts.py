@@ -110,7 +110,7 @@ def test_every_command_that_reads_it_repeats_them_in_one_line(
     episode = read_episode(world / "run.csv")
     assert check_episode(episode)[0] == LINE
     assert read_data([world / "run.csv"]).notes == (LINE,)
-    assert read_data([world / "explore.csv"], [world / "run.csv"]).notes == (LINE,)
+    assert read_data([world / "test.csv"], [world / "run.csv"]).notes == (LINE,)
     assert LINE in run_warnings(world / "run", [episode])
     assert call("plan_diagnosis", "--after", str(world / "run.csv")) == 0
     assert one_line(capsys.readouterr().err) == [f"warning: {LINE}"]

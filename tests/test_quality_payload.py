@@ -122,6 +122,15 @@ def test_a_sensor_mounted_the_other_way_round_is_found() -> None:
     assert holds(quantity(told, "weight"), arm.weight)
 
 
+def test_an_arm_whose_world_has_no_z_upwards_is_told_no_weight() -> None:
+    side = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])
+    for seed in range(4):
+        log = resting(Arm(), seed)
+        told = identify(replace(log, rotations=side * log.rotations))
+        for name in ("weight", "force_bias_x", "centre_of_mass_z"):
+            assert "z is not up" in quantity(told, name).reason
+
+
 def test_forces_without_torques_tell_the_load_and_no_centre_of_mass() -> None:
     arm = Arm()
     log = resting(arm, 9)

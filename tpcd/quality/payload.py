@@ -17,6 +17,13 @@ LEVER = 2e-3
 while x lags, add like vectors to first order only (1.3 mm in made recordings) [m]."""
 USELESS = {"N": 1.0, "N·m": 0.1}
 """An interval that is wider, either way, than the value and this tells nothing."""
+EXPLAINED = 0.7
+"""A weight that explains less of what forces at rest change by is none, where more is left than
+sensors are off by."""
+UPWARDS = (
+    "no weight along the world's z explains the forces at rest ({:.2g} N are left): z is not up,"
+    " the rotations are not the sensor's, or something was touched"
+)
 PLANAR = "readings are planar"
 HANGING = "what hangs on the sensor shows its centre of mass from that point, and not the point"
 WEIGHTLESS = "the load's weight is not told apart from none"
@@ -35,8 +42,8 @@ def payload(seen: Observed, basis: str = "", free: str = "") -> tuple[Quantity, 
     `basis` says what the observations are, `free` what is taken for granted.
     """
     found = weigh(seen)
-    if found is None:
-        reason = _why(seen)
+    if found is None or (seen.edges is None and not _explains(seen, found)):
+        reason = _why(seen) if found is None else UPWARDS.format(found.linear.scatter)
         kinds = (("force_bias", "N"), ("torque_bias", "N·m"), ("centre_of_mass", "m"),
                  ("sensor_rotation", "rad"), ("sensor_point", "m"))  # fmt: skip
         told = untold(("weight",), "N", reason, ORIENTATIONS)
@@ -50,6 +57,15 @@ def payload(seen: Observed, basis: str = "", free: str = "") -> tuple[Quantity, 
     )
     told = _forces(seen, found, "; ".join(part for part in (basis, free) if part))
     return (*told, *_torques(seen, found, told[0]))
+
+
+def _explains(seen: Observed, found: Load) -> bool:
+    """Whether a weight along the world's z is what forces at rest change by, but for what sensors
+    are off by."""
+    forces = seen.forces[found.kept][:, list(found.axes)]
+    changes = float(((forces - forces.mean(0)) ** 2).sum())
+    small = found.linear.scatter <= USELESS["N"]
+    return small or found.linear.squares < (1.0 - EXPLAINED) * changes
 
 
 def _why(seen: Observed) -> str:

@@ -210,3 +210,11 @@ def test_streams_of_several_clocks_are_checked_each_by_itself() -> None:
     wrench = Stream("wrench", stream.channels[7:13], stream.times, stream.values[:, 7:13])
     (told,) = alarms(check_channels([pose, frozen(wrench, ("F_y",), 800, 900)]))
     assert told.channels == ("F_y",) and told.start == pytest.approx(8.0)
+
+
+def test_an_angle_that_begins_again_at_a_full_turn_has_no_spikes() -> None:
+    random, times = np.random.default_rng(0), np.arange(2000) / 100.0
+    angle = 0.5 + 0.4975 * np.sin(times) + 1e-3 * random.standard_normal(len(times))
+    place = 0.1 * np.sin(times) + 1e-4 * random.standard_normal(len(times))
+    values = np.column_stack((place, np.remainder(angle, 2.0 * np.pi)))
+    assert not alarms(check_channels([Stream("made", ("x", "phi"), times, values)]))

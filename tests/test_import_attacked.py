@@ -100,3 +100,19 @@ def test_a_channel_that_was_not_recorded_is_no_other_convention(
     columns[column] = np.zeros(len(columns["t"]))
     serious = imported(tmp_path / "run.csv", columns).account.serious
     assert [each.kind for each in serious] == ["dead"] and name in serious[0].sentence
+
+
+def test_set_points_that_never_rest_are_named_and_no_shorter_window(tmp_path: Path) -> None:
+    columns = table()
+    columns["u_2"] = columns["u_2"] + 2e-5 * np.random.default_rng(0).standard_normal(
+        len(columns["t"])
+    )
+    with pytest.raises(LogError, match=r"nowhere held, and go 0\.\d+ mm .*; map the set point as"):
+        imported(tmp_path / "run.csv", columns)
+
+
+def test_set_points_of_another_point_are_no_drift(tmp_path: Path) -> None:
+    columns = table()
+    columns["u_2"] = columns["u_2"] + 8e-3
+    (told,) = imported(tmp_path / "run.csv", columns).account.doubts
+    assert "off by F_z" in told.sentence and "drift" not in told.sentence

@@ -18,6 +18,7 @@ from tpcd.logs.hypotheses import BEYOND_NOISE, LEAST_TURN, MISSED, WITHIN, Readi
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog
 from tpcd.logs.readings import Readings, same_episode
+from tpcd.logs.remains import SURE
 from tpcd.logs.settled import Settled, Stillness
 from tpcd.quality.finding import Finding, Weight, usable
 
@@ -37,8 +38,6 @@ LEAST_PRESSED, PRESSED_ALIKE = 0.2, 0.5
 LEAST_ZEROED = 2
 """Rows that show a zero taken in contact."""
 NOTHING_FELT = "K (x - u) is nowhere more than 1 N: no contact is felt"
-SURE = 5.0
-"""Standard errors from which a cause is told: by chance in one of a thousand recordings."""
 LARGE = 0.1
 """Part of the load of a channel below which it is arms and sensors as they are."""
 SENSOR_UNITS = ("m", "m", "rad", "N", "N", "N·m")
@@ -256,6 +255,9 @@ def _causes(read: Readings) -> list[str]:
     if drifts := _certain(found.drift, load):
         shown = _amounts(found.drift, drifts)
         causes.append(f"it drifts by {shown} from the first row to the last")
+    if off := _certain(found.offset, load):
+        shown = _amounts(found.offset, off)
+        causes.append(f"it is off by {shown} in all rows, as where set points are of another point")
     if bent := _certain(found.bend, load):
         shown = _amounts(found.bend, bent)
         causes.append(f"it bends by {shown} where it is largest, as of a sensor that saturates")

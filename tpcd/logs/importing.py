@@ -39,7 +39,7 @@ from tpcd.logs.joining import ROTATIONS
 from tpcd.logs.log import AXES, Log, LogError
 from tpcd.logs.plane import PlanarLog, Plane, WrenchReading, project
 from tpcd.logs.readings import Readings, compare
-from tpcd.logs.settled import BLOCKS, Settled, Stillness, find_settled
+from tpcd.logs.settled import BLOCKS, Settled, Stillness, find_settled, restless_commands
 from tpcd.logs.units import doubted_units
 from tpcd.quality.finding import Finding, Weight
 
@@ -176,7 +176,7 @@ def _settle(log: Log, choices: Importing) -> tuple[PlanarLog, Settled, Importing
         choices = _tared(log, settled, choices)
         planar = project(log, choices.plane, choices.wrench)
         settled = find_settled(planar, choices.stillness)
-    _check_rows(log, settled, choices)
+    _check_rows(log, settled, choices, planar.commands)
     return planar, settled, choices
 
 
@@ -235,7 +235,12 @@ def _tared(log: Log, settled: Settled, choices: Importing) -> Importing:
     return replace(choices, wrench=wrench)
 
 
-def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
+def _check_rows(
+    log: Log,
+    settled: Settled,
+    choices: Importing,
+    commands: Float[np.ndarray, "n 3"] | None,
+) -> None:
     if len(settled.rows) > 1 or (settled.commands is None and len(settled.rows)):
         return
     window = choices.stillness.window
@@ -254,6 +259,8 @@ def _check_rows(log: Log, settled: Settled, choices: Importing) -> None:
     elif settled.unsettled:
         problem = f"{len(settled.unsettled)} holds end while the arm still moves"
         remedy = "allow more --drift, or record longer holds"
+    elif restless := restless_commands(log.times, commands, window):
+        problem, remedy = restless, "map the set point as it was sent, before filters and noise"
     elif settled.brief:
         problem, remedy = f"{settled.brief} holds are shorter than {window:g} s", "lower --window"
     else:

@@ -1,14 +1,14 @@
-"""What w - K (x - u) is at rest, by cause: a factor, friction, a drift, a bend.
+"""What w - K (x - u) is at rest, by cause: a factor, friction, a drift, an offset, a bend.
 
 For each channel least squares of
 
-    w = g K (x - u) + f s + d t
+    w = g K (x - u) + f s + d t + c
 
 with the direction s in which the command went last, against which friction holds, and the time t
 from 0 in the first row, which is free, to 1 in the last. A factor g is of the stiffness or of the
-sensor. A bend is what another column K (x - u) |K (x - u)| then adds where that is largest, as of a
-sensor that saturates. What scatters about the fit is noise, which `tpcd.data.noise` holds against
-what is stated.
+sensor; an offset c is of set points of another point or frame than the pose. A bend is what another
+column K (x - u) |K (x - u)| then adds where that is largest, as of a sensor that saturates. What
+scatters about the fit is noise, which `tpcd.data.noise` holds against what is stated.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from jaxtyping import Float
 
 FEWEST = 8
 """Rows that show any of it."""
+SURE = 5.0
+"""Standard errors from which a cause is certain: by chance in one of a thousand recordings."""
 LEAST_PULL = 1e-5
 """A command that changes by less is the same [m, rad]."""
 
@@ -34,6 +36,8 @@ class Remains:
     """[N, N, N·m]"""
     drift: Float[np.ndarray, "2 3"]
     """From the first to the last row [N, N, N·m]."""
+    offset: Float[np.ndarray, "2 3"]
+    """In all rows [N, N, N·m]; NaN where it is not certain, and then left out of the fit."""
     bend: Float[np.ndarray, "2 3"]
     """What K (x - u) lacks where it is largest [N, N, N·m]."""
 
@@ -48,17 +52,22 @@ def remains(
     `floor` is added to what scatters of the wrench [N, N, N·m]: sensors that are off by less tell
     nothing.
     """
-    found = np.full((4, 2, 3), np.nan)
+    found = np.full((5, 2, 3), np.nan)
     last = _directions(rows[:, 3:6])
-    time = np.linspace(0.0, 1.0, len(rows))
+    time, all_rows = np.linspace(0.0, 1.0, len(rows)), np.ones(len(rows))
     for c in range(3 if len(rows) >= FEWEST else 0):
         spring, wrench = expected[:, c], rows[:, 6 + c]
-        found[:3, :, c] = _fit((spring, last[:, c], time), wrench, floor[c])
+        columns = (spring, last[:, c], time, all_rows)
+        whole = _fit(columns, wrench, floor[c])
+        if not abs(whole[3, 0]) > SURE * whole[3, 1]:
+            columns = columns[:3]
+            whole = _fit(columns, wrench, floor[c])
+        found[: len(whole), :, c] = whole
         largest = float(np.abs(spring).max())
         bent = spring * np.abs(spring) / max(largest, 1e-12)
-        value, error = _fit((bent, spring, last[:, c], time), wrench, floor[c])[0]
+        value, error = _fit((bent, *columns), wrench, floor[c])[0]
         # A straight line takes up what it can of a parabola.
-        found[3, :, c] = value * largest / 4.0, error * largest / 4.0
+        found[4, :, c] = value * largest / 4.0, error * largest / 4.0
     return Remains(*found)
 
 

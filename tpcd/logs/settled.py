@@ -24,6 +24,8 @@ from tpcd.quality.finding import overlapping
 BLOCKS = 4
 HELD = (1e-5, 1e-5, 1e-5)
 """A command that stays so close to where its hold began is held [m, m, rad]."""
+RESTLESS = 0.02
+"""Set points that keep to this part of all their motion for a window are meant to be held."""
 SCATTER = 3.0
 """Drift beyond what is allowed counts from so many standard errors of it."""
 
@@ -108,6 +110,26 @@ def find_holds(commands: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "h 2"]:
             begun = k
     holds.append((begun, len(rows)))
     return np.array(holds, dtype=np.int64)
+
+
+def restless_commands(
+    times: Float[np.ndarray, " n"], commands: Float[np.ndarray, "n 3"] | None, window: float
+) -> str:
+    """How far set points go in the quietest tenth of windows, where they are meant to be held but
+    never are: they scatter, or creep to where they were sent; "" where they are, or move on."""
+    windows = [] if commands is None else _windows(times, window)
+    if commands is None or not len(windows):
+        return ""
+    spans = np.stack([np.ptp(commands[first:end], axis=0) for first, end in windows])
+    parts = spans / np.maximum(np.ptp(commands, axis=0), 1e-9)
+    quiet = spans[np.argsort(parts.max(1))[len(spans) // 10]]
+    if (quiet <= HELD).all() or (quiet > RESTLESS * np.ptp(commands, axis=0) + HELD).any():
+        return ""
+    length, angle = 1e3 * float(quiet[:2].max()), float(np.degrees(quiet[2]))
+    return (
+        f"set points are nowhere held, and go {length:.2g} mm and {angle:.2g} degrees in"
+        f" {window:g} s where they are quietest"
+    )
 
 
 def _windows(times: Float[np.ndarray, " n"], window: float) -> Int[np.ndarray, "k 2"]:

@@ -27,6 +27,8 @@ TORQUES = ("T_x", "T_y", "T_z", "tau")
 WRENCH = (*FORCES, *TORQUES)
 POSITIONS = ("x", "y", "z")
 ROTATIONS = ("rx", "ry", "rz", "qx", "qy", "qz", "qw", "e1", "e2", "e3", "phi")
+COUNTED = ("e1", "e2", "e3", "phi")
+"""Angles that begin again after a turn."""
 POSE = (*POSITIONS, *ROTATIONS)
 UNITS = {
     **dict.fromkeys(POSITIONS, "m"),
@@ -81,7 +83,11 @@ def channels_of(streams: Sequence[Stream], names: Sequence[str]) -> Iterator[Cha
             samples = np.flatnonzero(np.isfinite(found).all(1))
             if len(samples):
                 weights = MIXED[: len(columns)] if len(columns) > 1 else np.ones(1)
-                values = found[samples] @ weights
+                whole = found[samples]
+                if any(stream.channels[k] in COUNTED for k in columns):
+                    # A turn back and forth at the end of the circle is no spike.
+                    whole = np.unwrap(whole, axis=0)
+                values = whole @ weights
                 step = sum(w * grid_step(v) for w, v in zip(weights, found[samples].T, strict=True))
                 yield Channel(name, stream, samples, values, find_habit(values, float(step)))
 

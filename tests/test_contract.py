@@ -14,7 +14,9 @@ import torch
 from contact_scenes import BOX, STIFFNESS, make_scene, vector
 
 from eval.blind.suites import MEDIUM, OUTSIDE
-from tpcd.belief.belief import Belief, estimate
+from tpcd.belief.belief import Belief, estimate, prior_belief
+from tpcd.belief.paper import estimate_paper
+from tpcd.belief.prior import make_prior
 from tpcd.belief.settings import EstimatorSettings, SamplerSettings
 from tpcd.contact import ContactScene
 from tpcd.contract import as_numbers, check_effect, check_stiffness
@@ -324,3 +326,50 @@ def test_an_outline_in_millimetres_is_refused_unless_the_caller_insists():
     with pytest.raises(ValueError, match="points_ee reaches .*millimetres.*unusual=True"):
         simulate_step(scene, POSE, COMMAND, STIFFNESS)
     simulate_step(scene, POSE, COMMAND, STIFFNESS, unusual=True)
+
+
+@pytest.mark.parametrize("learn", [estimate, prior_belief, estimate_paper])
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"poses": (2, 1, np.nan)}, r"poses is nan at \[2, 1\], expected a finite number"),
+        ({"wrenches": (1, 0, np.inf)}, r"wrenches is inf at \[1, 0\], expected a finite number"),
+        ({"sensor_std": (3, np.nan)}, r"sensor_std is nan at 3|sensor_std is nan, expected"),
+        ({"sensor_std": (3, -0.3)}, "sensor_std is .*expected none below 0"),
+    ],
+)
+def test_rows_that_nothing_can_be_learnt_from_are_named(episode: Episode, learn, change, told):
+    ((name, (*place, value)),) = change.items()
+    values = getattr(episode, name).clone()
+    values[tuple(place)] = value
+    shape = PolygonShape(builtin_outlines()["mug"])
+    with pytest.raises(ValueError, match=told):
+        list(learn(replace(episode, **{name: values}), shape, torch.Generator()))
+    with pytest.raises(ValueError, match="no rows"):
+        list(learn(episode.first(0), shape, torch.Generator()))
+
+
+@pytest.mark.parametrize(
+    ("name", "bounds", "told"),
+    [
+        ("friction", (-0.5, 0.5), "expected a positive range"),
+        ("friction", (0.9, 0.1), "expected finite low < high"),
+        ("wall_position", (0.1, np.inf), "expected finite low < high"),
+        ("scale", (0.0, 1.0), "expected a positive range"),
+        ("floor_height", (-20, 20), "looks like mm"),
+        ("friction", 0.5, r"prior of friction has shape \(\), expected 2 numbers"),
+    ],
+)
+def test_a_prior_that_a_scene_cannot_have_is_refused(episode: Episode, name, bounds, told):
+    with pytest.raises(ValueError, match=told):
+        replace(episode, priors={name: bounds}).check_learnable()
+    if "looks" not in told:
+        with pytest.raises(ValueError, match=told):
+            make_prior(PolygonShape(builtin_outlines()["mug"]), {name: bounds})
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_a_misfit_that_is_no_size_is_refused(value):
+    for name in ("misfit_sd", "misfit_spread", "least_misfit_sd", "least_misfit_spread"):
+        with pytest.raises(ValueError, match=f"{name} is .*expected a finite number"):
+            EstimatorSettings(**{name: value})

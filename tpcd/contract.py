@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.parameters import LARGEST_FRICTION
+
 LARGEST_LENGTH = 5.0
 """Lengths beyond this [m] are taken for millimetres: no arm reaches so far."""
 LARGEST_ANGLE = 2 * math.pi
@@ -128,6 +130,24 @@ def check_effect(name: str, parameter: str, value: float, unit: str) -> None:
             f"{name}.{parameter} is {value:g}, expected {shown} (at most {limit:g}): it looks like"
             f" {likely}; convert it"
         )
+
+
+def check_prior(name: str, bounds: Any, unit: str, unusual: bool = False) -> None:
+    """Refuse a range [low, high] that no scene parameter has or that, unless `unusual`, looks like
+    another unit; ValueError, of what is wrong and what to do."""
+    low, high = (float(bound) for bound in as_numbers(f"prior of {name}", bounds, 2, axes=1))
+    told = f"prior of {name} is [{low:g}, {high:g}], "
+    if not -math.inf < low < high < math.inf:
+        remedy = "swap them, or give a narrow range around a known value"
+        raise ValueError(f"{told}expected finite low < high; {remedy}")
+    largest, likely = (LARGEST_ANGLE, "degrees") if unit == "rad" else (LARGEST_LENGTH, "mm")
+    if unit != "1" and max(abs(low), abs(high)) > largest and not unusual:
+        raise ValueError(f"{told}which looks like {likely}; give it in {unit}")
+    if (low < 0 and name == "friction") or (low <= 0 and name == "scale"):
+        raise ValueError(f"{told}expected a positive range; raise low")
+    if name == "friction" and high > LARGEST_FRICTION:
+        limit = f"{LARGEST_FRICTION:g}"
+        raise ValueError(f"{told}expected at most {limit}; nothing slips from there on")
 
 
 def check_stiffness(

@@ -124,9 +124,10 @@ def estimate(
 
     The episode's own priors replace the defaults. With the `state` of an earlier step of the
     same estimation it goes on after that step. Raises ValueError where no particle can
-    explain a transition.
+    explain a transition, and for rows that are not finite.
     """
     settings = settings or EstimatorSettings()
+    episode.check_learnable()
     history = history_of(episode)
     target = target_of(episode, shape, settings)
     if state is None:
@@ -162,6 +163,7 @@ def prior_belief(
     Where it bears one, or none of the draws leaves it free, all of them alike.
     """
     settings = settings or EstimatorSettings()
+    episode.check_learnable()
     target = target_of(episode, shape, settings)
     prior, misfit = target.prior, target.misfit
     score = target.sample(settings.sampler.particles, generator)

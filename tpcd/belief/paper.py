@@ -80,9 +80,9 @@ class PaperSettings:
             raise ValueError(
                 f"particles {self.particles} must be >= 2 and memory {self.memory} >= 1"
             )
-        if len(self.covariance) != 6 or min(self.covariance) <= 0:
+        if len(self.covariance) != 6 or not all(0 < one < math.inf for one in self.covariance):
             raise ValueError(f"covariance is {self.covariance}, expected six positive numbers")
-        if self.roughness < 0 or not 0 <= self.resampling_share <= 1:
+        if not 0 <= self.roughness < math.inf or not 0 <= self.resampling_share <= 1:
             raise ValueError(
                 f"roughness {self.roughness} must be >= 0 and resampling_share "
                 f"{self.resampling_share} in [0, 1]"
@@ -105,6 +105,7 @@ def estimate_paper(
     that step. Raises ValueError where no particle explains the data.
     """
     settings = settings or PaperSettings()
+    episode.check_learnable()
     prior = make_prior(shape, episode.priors)
     count = settings.particles
     if state is None:
@@ -150,6 +151,7 @@ def paper_prior_belief(
 ) -> Belief:
     """The filter's belief before any transition."""
     settings = settings or PaperSettings()
+    episode.check_learnable()
     prior = make_prior(shape, episode.priors)
     vectors = _draw_prior(prior, settings.particles, generator)
     even = torch.full((settings.particles,), 1.0 / settings.particles, dtype=torch.float64)

@@ -16,10 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.contract import check_prior
 from tpcd.effects.protocol import Added, Effect, effect_parameters, parameter_bounds
 from tpcd.parameters import (
     DEFAULT_BOUNDS,
     SCENE_NAMES,
+    SCENE_UNITS,
     Parameters,
     parameter_names,
     parameter_units,
@@ -150,17 +152,17 @@ def make_prior(
 ) -> ParameterPrior:
     """The prior with the default bounds, replaced where `bounds` names an entry [SI units].
 
-    Raises ValueError for a name that is not a scene entry or bounds without width.
+    Raises ValueError for a name that is not a scene entry or bounds that it cannot have.
     """
     given = dict(bounds or {})
     unknown = sorted(set(given) - set(SCENE_NAMES))
     if unknown:
         raise ValueError(f"no parameter {unknown[0]!r}; expected one of {', '.join(SCENE_NAMES)}")
     low, high = [-1.0] * shape.latent_dim, [1.0] * shape.latent_dim
-    for name in SCENE_NAMES:
-        lower, upper = given.get(name, DEFAULT_BOUNDS[name])
-        if not lower < upper:
-            raise ValueError(f"prior of {name} is [{lower}, {upper}], expected low < high")
+    for name, unit in zip(SCENE_NAMES, SCENE_UNITS, strict=True):
+        both = given.get(name, DEFAULT_BOUNDS[name])
+        check_prior(name, both, unit, unusual=True)
+        lower, upper = both
         low.append(lower)
         high.append(upper)
     prior = ParameterPrior(

@@ -172,6 +172,10 @@ class EstimatorSettings:
             raise ValueError(
                 f"likelihood_power is {self.likelihood_power}, expected above 0 and at most 1"
             )
+        for name in ("misfit_sd", "misfit_spread", "least_misfit_spread", "least_misfit_sd"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < math.inf:
+                raise ValueError(f"{name} is {value}, expected a finite number of at least 0")
         if not self.closing_worth >= 0:
             raise ValueError(f"closing_worth is {self.closing_worth}, expected at least 0")
 

@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.contract import as_numbers, check_pose, check_stiffness
+from tpcd.contract import as_numbers, check_finite, check_pose, check_prior, check_stiffness
 from tpcd.data.limits import COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS
+from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
 from tpcd.quality.finding import Finding
 
 COLUMNS = ("step", *COMMAND_COLUMNS, *POSE_COLUMNS, *WRENCH_COLUMNS)
@@ -71,6 +72,18 @@ class Episode:
             if name in COLUMNS or np.shape(column) != (len(self),):
                 told = f"extra column {name!r} must be new and of length {len(self)}"
                 raise ValueError(told)
+
+    def check_learnable(self) -> None:
+        """Refuse rows, noise and priors that nothing can be learnt from; ValueError that names them."""
+        if len(self) == 0:
+            raise ValueError("the episode has no rows, expected one of the start pose at least")
+        for name in ("commands", "poses", "wrenches", "sensor_std"):
+            check_finite(name, getattr(self, name))
+        if bool((self.sensor_std < 0).any()):
+            raise ValueError(f"sensor_std is {self.sensor_std.tolist()}, expected none below 0")
+        for name, unit in zip(SCENE_NAMES, SCENE_UNITS, strict=True):
+            if name in self.priors:
+                check_prior(name, self.priors[name], unit, self.unusual)
 
     def __len__(self) -> int:
         """Number of rows, the start row included."""

@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
-from tpcd.contract import LARGEST_LENGTH, check_stiffness
+from tpcd.contract import check_prior, check_stiffness
 from tpcd.data.doubts import encode_doubts, parse_doubts
 from tpcd.errors import EpisodeError
 from tpcd.numerals import NUMBER
-from tpcd.parameters import LARGEST_FRICTION, SCENE_NAMES, SCENE_UNITS
+from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
 from tpcd.plain_yaml import read_yaml, to_yaml
 from tpcd.quality.finding import Finding
 
@@ -175,27 +175,10 @@ def _priors(path: Path, content: Any, unusual: bool) -> dict[str, tuple[float, f
         _check_known(path, "prior", str(name), SCENE_NAMES)
         unit = SCENE_UNITS[SCENE_NAMES.index(name)]
         low, high = _numbers(path, f"priors: {name}", value, 2, f"[low, high] [{unit}]")
-        if not low < high:
-            raise EpisodeError(
-                path,
-                f"priors: {name} is [{low:g}, {high:g}], expected low < high",
-                "swap them, or give a narrow range around a known value",
-            )
-        largest, likely = (2 * math.pi, "degrees") if unit == "rad" else (LARGEST_LENGTH, "mm")
-        if unit != "1" and max(abs(low), abs(high)) > largest and not unusual:
-            raise EpisodeError(
-                path, f"priors: {name} is [{low:g}, {high:g}], which looks like {likely}",
-                f"give it in {unit}",
-            )  # fmt: skip
-        if low < 0 and name == "friction" or low <= 0 and name == "scale":
-            raise EpisodeError(
-                path, f"priors: {name} starts at {low:g}, expected a positive range", "raise low"
-            )
-        if name == "friction" and high > LARGEST_FRICTION:
-            raise EpisodeError(
-                path, f"priors: friction ends at {high:g}, expected at most {LARGEST_FRICTION:g}",
-                "nothing slips from there on",
-            )  # fmt: skip
+        try:
+            check_prior(name, (low, high), unit, unusual)
+        except ValueError as error:
+            raise EpisodeError(path, *str(error).split("; ", 1)) from None
         priors[name] = (low, high)
     return priors
 

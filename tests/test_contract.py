@@ -23,6 +23,8 @@ from tpcd.contract import as_numbers, check_effect, check_stiffness
 from tpcd.data import Episode, read_episode, write_episode
 from tpcd.effects.catalogue import KNOWN, unit_of
 from tpcd.errors import EpisodeError
+from tpcd.policies.active import ActiveSettings
+from tpcd.policies.limits import Limits
 from tpcd.predict import ContactPredictor
 from tpcd.qp import ContactQP, solve
 from tpcd.shape.builtin import builtin_outlines
@@ -373,3 +375,10 @@ def test_a_misfit_that_is_no_size_is_refused(value):
     for name in ("misfit_sd", "misfit_spread", "least_misfit_sd", "least_misfit_spread"):
         with pytest.raises(ValueError, match=f"{name} is .*expected a finite number"):
             EstimatorSettings(**{name: value})
+
+
+def test_limits_and_budgets_of_another_kind_are_refused():
+    with pytest.raises(ValueError, match="step, low and high have 2, 3 and 3 numbers, expected 3"):
+        Limits(step=(0.08, 0.3))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="particles is 1.5, expected a whole number"):
+        ActiveSettings(particles=1.5)  # type: ignore[arg-type]

@@ -60,9 +60,21 @@ def test_the_box_is_step_workspace_and_blocked_arm_together() -> None:
         {"force": 0.0},
         {"probability": 1.0},
         {"low": (1.0, 0.0, 0.0), "high": (0.0,) * 3},
+        {"step": (0.08, 0.08, math.nan)},
+        {"step": (0.08, math.inf, 0.3)},
     ):
         with pytest.raises(ValueError, match="expected|must be"):
             Limits(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("first", 1), ("elite", 1), ("rounds", -1), ("strides", math.nan), ("strides", 0.0),
+     ("stride_cost", -1.0), ("stride_cost", math.inf)],
+)  # fmt: skip
+def test_a_search_without_meaning_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} (is )?{value}"):
+        replace(SMALL, **{name: value})
 
 
 def test_excess_probability_is_the_share_of_particles_whose_floor_is_too_high(

@@ -76,7 +76,7 @@ class PaperSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings without meaning."""
-        if self.particles < 2 or self.memory < 1:
+        if not (self.particles >= 2 and self.memory >= 1):
             raise ValueError(
                 f"particles {self.particles} must be >= 2 and memory {self.memory} >= 1"
             )

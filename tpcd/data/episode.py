@@ -74,7 +74,7 @@ class Episode:
                 raise ValueError(told)
 
     def check_learnable(self) -> None:
-        """Refuse rows, noise and priors that nothing can be learnt from; ValueError that names them."""
+        """Refuse rows, noise and priors that nothing can be learnt from; ValueError names them."""
         if len(self) == 0:
             raise ValueError("the episode has no rows, expected one of the start pose at least")
         for name in ("commands", "poses", "wrenches", "sensor_std"):

@@ -14,6 +14,7 @@ set probability are not taken; where all others do, the arm goes to where it is.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -58,6 +59,17 @@ class ActiveSettings:
     """Particles for that."""
     look_ahead: bool = False
     """Add to each finalist's gain that of the best command after it."""
+
+    def __post_init__(self) -> None:
+        """Refuse budgets without meaning."""
+        least = {"first": 2, "rounds": 0, "later": 1, "elite": 2, "particles": 1, "finalists": 1}
+        for name, limit in {**least, "final_particles": 1}.items():
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < limit:
+                raise ValueError(f"{name} is {value}, expected a whole number of at least {limit}")
+        if not 0 < self.strides < math.inf or not 0 <= self.stride_cost < math.inf:
+            both = f"strides is {self.strides} and stride_cost {self.stride_cost}"
+            raise ValueError(f"{both}, expected finite numbers above 0, and of at least 0")
 
 
 @dataclass(frozen=True)

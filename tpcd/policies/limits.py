@@ -29,8 +29,11 @@ class Limits:
 
     def __post_init__(self) -> None:
         """Refuse limits without meaning."""
-        if not self.force > 0 or min(self.step) <= 0:
+        if not self.force > 0 or not all(0 < step < math.inf for step in self.step):
             raise ValueError(f"force limit {self.force} and step {self.step} must be positive")
+        if not len(self.step) == len(self.low) == len(self.high) == 3:
+            lengths = f"{len(self.step)}, {len(self.low)} and {len(self.high)} numbers"
+            raise ValueError(f"step, low and high have {lengths}, expected 3 (x, z, phi)")
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError(f"workspace from {self.low} to {self.high}, expected low < high")
         if not 0 < self.probability < 1:

@@ -26,9 +26,9 @@ from eval.measured.pivoting import Held, episode, joined, read_held
 from eval.measured.sets import FOLDER_VARIABLE, Recording, measured_folder, recordings, write_table
 from tpcd.data.checks import check_rows
 from tpcd.errors import FileError
-from tpcd.quality.identify import identify
-from tpcd.quality.quantity import quantity
-from tpcd.quality.rests import find_rests
+from tpcd.identification.identify import identify
+from tpcd.identification.quantity import quantity
+from tpcd.identification.rests import find_rests
 
 PAGE = Path(package.__file__).parent / "README.md"
 RESULTS = Path(package.__file__).parent / "results.json"

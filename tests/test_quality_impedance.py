@@ -12,12 +12,12 @@ from made_arm import Arm, moving, truth
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
+from tpcd.identification.blocks import block_edges, correlation_time, jackknife, moments
+from tpcd.identification.identify import identify
+from tpcd.identification.parity import fit_parity
+from tpcd.identification.quantity import LEVEL, Quantity, quantity, untold
+from tpcd.identification.springs import springs
 from tpcd.logs.log import Log
-from tpcd.quality.blocks import block_edges, correlation_time, jackknife, moments
-from tpcd.quality.identify import identify
-from tpcd.quality.parity import fit_parity
-from tpcd.quality.quantity import LEVEL, Quantity, quantity, untold
-from tpcd.quality.springs import springs
 
 AXES = ("x", "y", "z")
 SIX = (*AXES, "rx", "ry", "rz")

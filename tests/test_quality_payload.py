@@ -11,10 +11,10 @@ from made_arm import Arm, resting, truth
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
+from tpcd.identification.identify import identify
+from tpcd.identification.quantity import LEVEL, Quantity, quantity
+from tpcd.identification.rests import find_rests
 from tpcd.quality.finding import Finding, Weight
-from tpcd.quality.identify import identify
-from tpcd.quality.quantity import LEVEL, Quantity, quantity
-from tpcd.quality.rests import find_rests
 
 AXES = ("x", "y", "z")
 WEIGHED = ("weight", "force_bias", "torque_bias", "centre_of_mass", "sensor_rotation")

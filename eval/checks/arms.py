@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from tests.made_arm import Arm, moving, resting, truth
+from tpcd.identification.identify import identify
+from tpcd.identification.quantity import Quantity
 from tpcd.logs.log import Log
-from tpcd.quality.identify import identify
-from tpcd.quality.quantity import Quantity
 
 SECONDS = 60.0
 LOADED = ("weight", "force_bias", "torque_bias", "centre_of_mass", "sensor_rotation")

@@ -68,7 +68,7 @@ def evaluate_measured(config: Measurements) -> None:
 
 
 def _measured(recording: Recording, out: Path) -> dict[str, Any]:
-    from tpcd.quality.identify import identify
+    from tpcd.identification.identify import identify
 
     log = recording.read()
     told = [asdict(each) for each in identify(log)]
@@ -139,7 +139,7 @@ def _pivoted(held: Sequence[Held], config: Measurements, out: Path) -> dict[str,
     from eval.measured.pivoting import NOTES, episode, joined
     from eval.measured.sets import Recording, write_table
     from tpcd.data.files import episode_contents, write_together
-    from tpcd.quality.identify import identify
+    from tpcd.identification.identify import identify
 
     columns = joined(held)
     table = write_table(out / "tables" / "pbal.csv", columns)

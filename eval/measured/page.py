@@ -12,7 +12,7 @@ from typing import Any
 
 from tpcd.cli import run
 from tpcd.files import read_json, write_json, write_text
-from tpcd.quality.quantity import Quantity
+from tpcd.identification.quantity import Quantity
 
 HEAD = """# Real recordings
 

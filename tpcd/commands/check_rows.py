@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from tpcd.commands.checked import Checked
+from tpcd.identification.quantity import Quantity
 from tpcd.quality.channels import POSE, ROTATIONS, UNITS, WRENCH, Channel, channels_of
 from tpcd.quality.finding import Finding, Weight
-from tpcd.quality.quantity import Quantity
 
 CLOCK_KINDS = (
     *("rate", "gap", "silent", "clock_back", "clock_jump"),

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tpcd.identification.identify import identify
+from tpcd.identification.quantity import Quantity
 from tpcd.logs.bags import is_bag, read_bag
 from tpcd.logs.columns import log_from_columns, parse_map, read_numbers
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.table import Table, read_columns
 from tpcd.quality.finding import Finding, usable
-from tpcd.quality.identify import identify
 from tpcd.quality.noise import RestNoise, check_noise_at_rest, noise_at_rest
-from tpcd.quality.quantity import Quantity
 from tpcd.quality.recording import check_recording
 from tpcd.quality.stream import Stream
 from tpcd.quality.suggest import Suggestion, suggest_map

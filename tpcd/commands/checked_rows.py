@@ -13,8 +13,8 @@ from tpcd.data.checks import episode_findings
 from tpcd.data.episode import COLUMNS, Episode
 from tpcd.data.files import read_episode
 from tpcd.data.noise import noise_findings
+from tpcd.identification.identify import identify
 from tpcd.logs.columns import log_from_columns
-from tpcd.quality.identify import identify
 from tpcd.quality.stream import Stream
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from tpcd.identification.load import FEWEST, Load, least_squares, skew, turning_axes, weigh
+from tpcd.identification.quantity import Quantity, untold
+from tpcd.identification.rests import Observed
 from tpcd.logs.log import AXES
-from tpcd.quality.load import FEWEST, Load, least_squares, skew, turning_axes, weigh
-from tpcd.quality.quantity import Quantity, untold
-from tpcd.quality.rests import Observed
 
 LEVER = 2e-3
 """What a lever is off by where it is told beside springs that turn: rotations of x to u, and of u

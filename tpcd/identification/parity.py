@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.logs.log import AXES
-from tpcd.quality.blocks import (
+from tpcd.identification.blocks import (
     Estimate,
     block_edges,
     correlation_time,
@@ -26,7 +25,8 @@ from tpcd.quality.blocks import (
     partial,
     solve,
 )
-from tpcd.quality.springs import Springs
+from tpcd.identification.springs import Springs
+from tpcd.logs.log import AXES
 
 WIDE = np.radians(10.0)
 """An end effector that turned less shows nothing of which axes a wrench is in [rad]."""

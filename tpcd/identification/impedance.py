@@ -10,11 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tpcd.quality.blocks import Estimate
-from tpcd.quality.lags import pose_lag, wrench_lag
-from tpcd.quality.parity import Axis, Parity, choose_frames, displacements, readings
-from tpcd.quality.quantity import Quantity, untold
-from tpcd.quality.springs import Springs
+from tpcd.identification.blocks import Estimate
+from tpcd.identification.lags import pose_lag, wrench_lag
+from tpcd.identification.parity import Axis, Parity, choose_frames, displacements, readings
+from tpcd.identification.quantity import Quantity, untold
+from tpcd.identification.springs import Springs
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
 UNITS = ("N", "N·m")

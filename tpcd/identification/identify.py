@@ -14,15 +14,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tpcd.identification.blocks import block_edges, correlation_time
+from tpcd.identification.impedance import NAMES, PRESS, computed, impedance
+from tpcd.identification.load import weigh
+from tpcd.identification.parity import Parity, spring_wrench
+from tpcd.identification.payload import ORIENTATIONS, payload, useless
+from tpcd.identification.quantity import Quantity, quantity, untold
+from tpcd.identification.rests import UP, Observed, find_rests, observe_rests, recorded_axes
+from tpcd.identification.springs import springs
 from tpcd.logs.log import AXES, Log
-from tpcd.quality.blocks import block_edges, correlation_time
-from tpcd.quality.impedance import NAMES, PRESS, computed, impedance
-from tpcd.quality.load import weigh
-from tpcd.quality.parity import Parity, spring_wrench
-from tpcd.quality.payload import ORIENTATIONS, payload, useless
-from tpcd.quality.quantity import Quantity, quantity, untold
-from tpcd.quality.rests import UP, Observed, find_rests, observe_rests, recorded_axes
-from tpcd.quality.springs import springs
 
 CLEARER = 4.0
 """One frame is told by rests where the other leaves so many times more, in squares."""

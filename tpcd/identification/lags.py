@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.quality.blocks import block_edges, correlation_time, jackknife
-from tpcd.quality.parity import Parity, displacements, readings
-from tpcd.quality.quantity import Quantity
-from tpcd.quality.springs import Springs
+from tpcd.identification.blocks import block_edges, correlation_time, jackknife
+from tpcd.identification.parity import Parity, displacements, readings
+from tpcd.identification.quantity import Quantity
+from tpcd.identification.springs import Springs
 
 LONGEST = 0.5
 """Shifts that are looked at, either way [s]."""

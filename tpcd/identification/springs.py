@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from tpcd.identification.blocks import block_edges, correlation_time
+from tpcd.identification.rests import SHORTEST, recorded_axes
 from tpcd.logs.log import AXES, Log
-from tpcd.quality.blocks import block_edges, correlation_time
-from tpcd.quality.rests import SHORTEST, recorded_axes
 
 MOST = 20_000
 """Samples that are looked at; more are thinned out evenly."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import t as student
 
-from tpcd.quality.quantity import LEVEL
+from tpcd.identification.quantity import LEVEL
 
 MOST_BLOCKS, FEWEST_BLOCKS = 40, 5
 LENGTHS = 6.0

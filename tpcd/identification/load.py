@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as f_distribution
 from scipy.stats import t as student
 
-from tpcd.quality.blocks import moments, solve
-from tpcd.quality.quantity import LEVEL
-from tpcd.quality.rests import Observed
+from tpcd.identification.blocks import moments, solve
+from tpcd.identification.quantity import LEVEL
+from tpcd.identification.rests import Observed
 
 FEWEST = 4
 """Orientations below which nothing is left to learn the error from."""

@@ -180,14 +180,18 @@ def _beside_springs(parity: Parity, stiffness: Float[np.ndarray, " 6"], torques:
 
 def _hull(same: Sequence[Quantity]) -> Quantity:
     """The first, with an interval as wide about every other value as about its own: what is left
-    at an end of the stiffness is no noise, but what wrong springs leave."""
+    at an end of the stiffness is no noise, but what wrong springs leave. Of a rotation it holds all
+    intervals: friction and damping, which are as they fit best, turn what is pressed with too."""
     untold_ones = [each for each in same if not each.told]
     if untold_ones:
         return untold_ones[0]
-    found, values = same[0], [each.value for each in same if isinstance(each.value, float)]
+    found = same[0]
     if found.interval is not None and isinstance(found.value, float):
-        low, high = (end - found.value for end in found.interval)
-        found = replace(found, interval=(min(values) + low, max(values) + high))
+        own = [end - found.value for end in found.interval]
+        ends = [float(each.value) + end for each in same for end in own]  # pyright: ignore
+        if found.name.startswith("sensor_rotation"):
+            ends += [end for each in same for end in each.interval or ()]
+        found = replace(found, interval=(min(ends), max(ends)))
     if not useless(found):
         return found
     reason = "the stiffness is known too roughly for what is left beside it"

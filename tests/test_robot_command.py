@@ -112,7 +112,7 @@ def test_doubts_of_a_stopped_run_stay_with_it_and_are_told_by_all_that_comes_aft
     whole = read_episode(out / "explore.csv")
     assert len(whole) == 4 and list(map(str, whole.doubts)) == [str(doubt)]
     assert call(*predict, "--out", str(tmp_path / "b.csv")) == 0
-    (line,) = [each for each in capsys.readouterr().err.splitlines() if "learnt from" in each]
+    (line,) = [each for each in capsys.readouterr().err.splitlines() if "with doubts" in each]
     assert line.endswith(f"explore.csv was accepted in spite of 1 doubt: doubt: {doubt}")
 
 

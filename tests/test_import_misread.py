@@ -1,4 +1,4 @@
-"""Tables and readings that fresh eyes found to be believed or refused for a wrong reason."""
+"""Tables and readings that are easily believed, or refused, for a wrong reason."""
 
 from __future__ import annotations
 

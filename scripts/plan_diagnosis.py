@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from tpcd.truth.diagnosis_plan import Planned
 
-FAR, TURNED = 5.0, 6.3
-"""A length or angle beyond this was meant in another unit [m, rad]."""
 ROOM = 0.002
 """What the limits of the arm leave besides [m]."""
 
@@ -68,15 +66,17 @@ class Planning:
             self._check_plan()
 
     def _check_plan(self) -> None:
+        from tpcd.contract import LARGEST_ANGLE, LARGEST_LENGTH
+
         if len(self.start) != 3:
             raise ValueError(f"start has {len(self.start)} numbers, expected x z phi [m, m, rad]")
         places = {"floor_height": self.floor_height, "wall_position": self.wall_position}
         for name, value in {**places, "start x": self.start[0], "start z": self.start[1]}.items():
             if value is None:
                 raise ValueError(f"a plan needs --{name}: where the hand is at touch, roughly [m]")
-            if abs(value) > FAR:
+            if abs(value) > LARGEST_LENGTH:
                 raise ValueError(f"{name} is {value:g}, expected m; it looks like millimetres")
-        if abs(self.start[2]) > TURNED:
+        if abs(self.start[2]) > LARGEST_ANGLE:
             told = f"start phi is {self.start[2]:g}, expected rad; it looks like degrees"
             raise ValueError(told)
 

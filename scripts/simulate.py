@@ -39,8 +39,6 @@ NOISE = {
     "noise_torque": ("tau",),
 }
 """What can make a row of the episode one that no recording has; noise of its columns only."""
-SPREAD = 0.2
-"""Part by which the prior of an object's scale may make it larger or smaller."""
 FILE_ENDINGS = (".csv", ".parquet", ".yaml", ".truth.csv", ".truth.yaml")
 """Of the files that an episode here can have."""
 
@@ -135,13 +133,15 @@ class Simulation:
 
         from tpcd.contract import check_effect, check_stiffness
         from tpcd.effects.catalogue import unit_of
+        from tpcd.parameters import DEFAULT_BOUNDS
         from tpcd.shape.outline import LARGEST_SIZE, SMALLEST_SIZE
 
         check_stiffness(torch.tensor(self.stiffness, dtype=torch.float64), insist="")
         for effect, given in self.hidden.items():
             for parameter, value in given.items():
                 check_effect(effect, parameter, value, unit_of(effect, parameter))
-        least, most = (1 - SPREAD) * SMALLEST_SIZE, (1 + SPREAD) * LARGEST_SIZE
+        smaller, larger = DEFAULT_BOUNDS["scale"]
+        least, most = smaller * SMALLEST_SIZE, larger * LARGEST_SIZE
         if self.scale is not None and not least <= self.scale * longest <= most:
             raise ValueError(
                 f"scale is {self.scale:g}, which makes the object {self.scale * longest:.3g} m"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tpcd.identification.quantity import Quantity
 from tpcd.logs.log import Log
 
 
@@ -38,6 +39,18 @@ class Arm:
     """Typical contact force [N]."""
     turn: float = 0.5
     """Typical rotation [rad]."""
+
+
+def holds(told: Quantity, value: float) -> bool:
+    """Whether an interval that is told holds a value."""
+    assert told.interval is not None, told
+    return told.interval[0] <= value <= told.interval[1]
+
+
+def half_width(told: Quantity) -> float:
+    """Half an interval that is told."""
+    assert told.interval is not None, told
+    return (told.interval[1] - told.interval[0]) / 2
 
 
 def truth(arm: Arm) -> dict[str, float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_arm import Arm, moving, truth
+from made_arm import Arm, half_width, holds, moving, truth
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
@@ -24,16 +24,6 @@ SIX = (*AXES, "rx", "ry", "rz")
 RUNS, SECONDS = 12, 60.0
 FALSE_ALARM = 1e-4
 """Of one quantity's coverage test."""
-
-
-def holds(told: Quantity, value: float) -> bool:
-    assert told.interval is not None, told
-    return told.interval[0] <= value <= told.interval[1]
-
-
-def half_width(told: Quantity) -> float:
-    assert told.interval is not None, told
-    return (told.interval[1] - told.interval[0]) / 2
 
 
 @pytest.mark.parametrize(

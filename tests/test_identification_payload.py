@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_arm import Arm, resting, truth
+from made_arm import Arm, half_width, holds, resting, truth
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from tpcd.identification.identify import identify
-from tpcd.identification.quantity import LEVEL, Quantity, quantity
+from tpcd.identification.quantity import LEVEL, quantity
 from tpcd.identification.rests import find_rests
 from tpcd.quality.finding import Finding, Weight
 
@@ -21,16 +21,6 @@ WEIGHED = ("weight", "force_bias", "torque_bias", "centre_of_mass", "sensor_rota
 RUNS = 60
 FALSE_ALARM = 1e-5
 """Of one quantity's coverage test."""
-
-
-def holds(told: Quantity, value: float) -> bool:
-    assert told.interval is not None, told
-    return told.interval[0] <= value <= told.interval[1]
-
-
-def half_width(told: Quantity) -> float:
-    assert told.interval is not None, told
-    return (told.interval[1] - told.interval[0]) / 2
 
 
 @pytest.mark.parametrize("frame", ["tool", "world"])

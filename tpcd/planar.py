@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,6 +17,24 @@ from torch import Tensor
 def wrap_angle(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return the angle wrapped to (-pi, pi] [rad]."""
     return math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
+
+
+def short_way(offsets: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Differences of poses (x, z, angle, whatever follows) [m, m, rad] with the angle in
+    [-pi, pi)."""
+    found = np.array(offsets)
+    found[:, 2] = np.remainder(found[:, 2] + math.pi, 2 * math.pi) - math.pi
+    return found
+
+
+def spring_wrench(
+    poses: Float[np.ndarray, "n 3"],
+    commands: Float[np.ndarray, "n 3"],
+    stiffness: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """The wrench (F_x, F_z, tau) [N, N, N·m] that holds an impedance-controlled arm at rest at its
+    pose, w = K (x - u), with the diagonal of K [N/m, N/m, N·m/rad]; the angle the short way."""
+    return stiffness * short_way(poses - commands)
 
 
 def rotate(

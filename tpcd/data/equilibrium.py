@@ -7,10 +7,10 @@ Where it is broken by more than the noise, the stiffness, the sensor or the nois
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from jaxtyping import Float
+
+from tpcd.planar import spring_wrench
 
 LEAST_ROWS = 3
 """Rows beyond the noise that tell whether the law holds."""
@@ -89,7 +89,7 @@ def _ratios(
     """The same for each channel, NaN without noise, and how many readings that is of."""
     scale = _noise(stiffness, sensor_std)
     scale = np.where(scale > 0, scale, np.nan)
-    left = (rows[2] - _expected(rows, stiffness))[1:] / scale
+    left = (rows[2] - spring_wrench(rows[1], rows[0], stiffness))[1:] / scale
     return np.sqrt(np.square(left).mean(0)), int(np.isfinite(left).sum())
 
 
@@ -98,12 +98,6 @@ def _noise(
 ) -> Float[np.ndarray, " 3"]:
     """Standard deviation of w - K (x - u) by the noise of the sensors."""
     return np.hypot(sensor_std[3:], stiffness * sensor_std[:3])
-
-
-def _expected(rows: Rows, stiffness: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "n 3"]:
-    away = rows[1] - rows[0]
-    away[:, 2] = np.remainder(away[:, 2] + math.pi, 2 * math.pi) - math.pi
-    return stiffness * away
 
 
 def _orders(rows: Rows) -> dict[tuple[str, str], Rows]:
@@ -132,7 +126,7 @@ def _left(
 ) -> float | None:
     """Part of the wrench, in its noise, that K (pose - command) leaves over in the rows in which
     one of the two is beyond the noise; None where these are few."""
-    expected, felt = _expected(rows, stiffness) / scale, rows[2] / scale
+    expected, felt = spring_wrench(rows[1], rows[0], stiffness) / scale, rows[2] / scale
     some = (np.maximum(np.abs(expected), np.abs(felt)) > BEYOND).any(1)
     if some.sum() < LEAST_ROWS:
         return None

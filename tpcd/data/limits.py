@@ -15,6 +15,7 @@ import numpy as np
 from tpcd.contract import COUNTED, LARGEST_ANGLE, LARGEST_LENGTH
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
+from tpcd.planar import short_way
 
 COMMAND_COLUMNS = ("u_x", "u_z", "u_phi")
 POSE_COLUMNS = ("x", "z", "phi")
@@ -59,17 +60,14 @@ def check_jumps(
     A step of command or pose beyond `LARGEST_JUMP` is explained if the change of
     x - u - w / K with it is less than `UNEXPLAINED` of the step.
     """
-    away = poses - commands
-    away[:, 2] = _wrapped(away[:, 2])
-    strange = np.diff(away - wrenches / stiffness, axis=0)
-    strange[:, 2] = _wrapped(strange[:, 2])
+    away = short_way(poses - commands)
+    strange = short_way(np.diff(away - wrenches / stiffness, axis=0))
     jumps: list[tuple[int, float, str, str]] = []
     for what, names, values in (
         ("command", COMMAND_COLUMNS, commands),
         ("pose", POSE_COLUMNS, poses),
     ):
-        steps = np.diff(values, axis=0)
-        steps[:, 2] = _wrapped(steps[:, 2])
+        steps = short_way(np.diff(values, axis=0))
         position, angle = f"columns {names[0]}, {names[1]}", f"column {names[2]}"
         frame, in_rad = f"check the frame of the {what}s", f"check that {names[2]} is in rad"
         for columns, part, verb, largest, unit, remedy in (
@@ -88,10 +86,6 @@ def check_jumps(
         _, _, told, remedy = min(jumps)
         remedy += ", check the units and the stiffness, or split the episode there"
         raise EpisodeError(path, told, remedy)
-
-
-def _wrapped(angles: np.ndarray) -> np.ndarray:
-    return np.remainder(angles + math.pi, 2 * math.pi) - math.pi
 
 
 def _check_column(path: Path, name: str, column: np.ndarray, limit: tuple[float, str, str]) -> None:

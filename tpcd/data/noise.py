@@ -23,6 +23,7 @@ from jaxtyping import Float
 
 from tpcd.data.header import SENSOR_NAMES
 from tpcd.errors import EpisodeError
+from tpcd.planar import short_way
 from tpcd.quality.finding import Finding, Weight
 
 if TYPE_CHECKING:
@@ -118,8 +119,8 @@ def check_noise(episode: Episode) -> list[str]:
     path = episode.path or Path("the episode")
     stated, readings = episode.sensor_std.numpy(), _readings(episode)
     targets = np.column_stack((episode.commands.numpy(), np.zeros((len(readings), 3))))
-    away = np.abs(_wrapped(readings - targets))[1:]
-    repeats = np.abs(_wrapped(np.diff(episode.commands.numpy(), axis=0))).max(1) <= 1e-9
+    away = np.abs(short_way(readings - targets))[1:]
+    repeats = np.abs(short_way(np.diff(episode.commands.numpy(), axis=0))).max(1) <= 1e-9
     alone = ~(repeats | np.append(repeats[1:], False))
     measured = [(name, k, *_ratio(episode, k)) for k, name in enumerate(SENSOR_NAMES)]
     for name, k, ratio, freedom, _ in measured:
@@ -205,14 +206,14 @@ def _pauses(episodes: Sequence[Episode]) -> tuple[Float[np.ndarray, " 6"], int]:
     squares, freedom = np.zeros(6), 0
     for episode in episodes:
         commands, readings = episode.commands.numpy(), _readings(episode)
-        changes = np.abs(_wrapped(np.diff(commands, axis=0))).max(1) > 1e-9
+        changes = np.abs(short_way(np.diff(commands, axis=0))).max(1) > 1e-9
         groups = np.split(np.arange(len(readings)), np.flatnonzero(changes) + 1)
         for rows in groups:
             # The start row's command is the measured pose.
             rows = rows[rows > 0]
             if len(rows) > 1:
                 part = readings[rows]
-                part = part[0] + _wrapped(part - part[0])
+                part = part[0] + short_way(part - part[0])
                 squares += ((part - part.mean(0)) ** 2).sum(0)
                 freedom += len(rows) - 1
     return squares, freedom
@@ -223,7 +224,7 @@ def _parity(episodes: Sequence[Episode]) -> tuple[Float[np.ndarray, " 3"], int]:
     squares, freedom = np.zeros(3), 0
     for episode in episodes:
         away, wrenches = _away(episode)[1:], episode.wrenches.numpy()[1:]
-        moved = _wrapped(np.diff(episode.commands.numpy(), axis=0))
+        moved = short_way(np.diff(episode.commands.numpy(), axis=0))
         if len(away) <= CURVES:
             continue
         residual = wrenches - episode.stiffness.numpy() * away
@@ -247,11 +248,4 @@ def _readings(episode: Episode) -> Float[np.ndarray, "n 6"]:
 
 
 def _away(episode: Episode) -> Float[np.ndarray, "n 3"]:
-    return _wrapped((episode.poses - episode.commands).numpy())
-
-
-def _wrapped(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """The same with the angle, which is the third entry, within half a turn."""
-    values = values.copy()
-    values[:, 2] = np.remainder(values[:, 2] + math.pi, 2 * math.pi) - math.pi
-    return values
+    return short_way((episode.poses - episode.commands).numpy())

@@ -20,6 +20,7 @@ from tpcd.logs.plane import PlanarLog
 from tpcd.logs.readings import Readings, same_episode
 from tpcd.logs.remains import SURE
 from tpcd.logs.settled import Settled, Stillness
+from tpcd.planar import spring_wrench
 from tpcd.quality.finding import Finding, Weight, usable
 
 OUT_OF_PLANE_MOTION = 0.1
@@ -183,7 +184,7 @@ def dead_channels(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Accou
     """Forces and torque that read one number in all rows, though the springs pull differently."""
     if settled.commands is None or len(settled.rows) < 2:
         return None
-    spring = np.ptp(spring_wrench(settled, stiffness), axis=0)
+    spring = np.ptp(spring_of(settled, stiffness), axis=0)
     least = np.array([1.0, 1.0, 0.05])
     dead = np.flatnonzero((np.ptp(settled.rows[:, 3:], axis=0) == 0) & (spring > least))
     if not len(dead):
@@ -203,7 +204,7 @@ def zeroed_in_contact(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> A
     Such a sensor had its zero taken in contact; an arm that lags, or a dead band, leaves its
     readings at zero.
     """
-    spring = spring_wrench(settled, stiffness)[:, :2]
+    spring = spring_of(settled, stiffness)[:, :2]
     noise = np.hypot(settled.noise[3:5], stiffness[:2] * settled.noise[:2])
     least = max(BEYOND_NOISE * float(np.linalg.norm(noise)), LEAST_PRESSED)
     begun = spring[0]
@@ -349,13 +350,11 @@ def _used(planar: PlanarLog) -> PlanarLog:
     )
 
 
-def spring_wrench(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "k 3"]:
+def spring_of(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "k 3"]:
     """K (x - u) of the settled rows [N, N, N·m]; NaN where commands are unknown."""
     if settled.commands is None:
         return np.full((len(settled.rows), 3), np.nan)
-    away = settled.rows[:, :3] - settled.commands
-    away[:, 2] = np.remainder(away[:, 2] + math.pi, 2 * math.pi) - math.pi
-    return stiffness * away
+    return spring_wrench(settled.rows[:, :3], settled.commands, stiffness)
 
 
 def _told(value: float) -> str:

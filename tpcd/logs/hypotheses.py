@@ -26,6 +26,7 @@ from tpcd.logs.conventions import AtRest, Change, factor_of_stiffness, torque_ab
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import Motion, Plane, motion_in_plane, project
 from tpcd.logs.remains import Remains, remains
+from tpcd.planar import spring_wrench
 from tpcd.quality.lever import depth_of_contact
 
 MOST_CHANGES = 3
@@ -175,7 +176,7 @@ class Judge:
         rows: Float[np.ndarray, "k 9"],
         swing: Float[np.ndarray, " k"],
     ) -> Reading:
-        expected = _spring(rows[:, :3], rows[:, 3:6], rest.stiffness)
+        expected = spring_wrench(rows[:, :3], rows[:, 3:6], rest.stiffness)
         wrenches, turn = rows[:, 6:], self._motion(rest.log)[1]
         squares = ((wrenches - expected) ** 2).mean(0)
         told, springs = (wrenches**2).mean(0), (expected**2).mean(0)
@@ -202,7 +203,7 @@ class Judge:
     ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], float] | None:
         """The factors of the stiffness that fit the rows best, their standard errors, and what
         they cost; None where it is as stated."""
-        expected = _spring(rows[:, :3], rows[:, 3:6], rest.stiffness)
+        expected = spring_wrench(rows[:, :3], rows[:, 3:6], rest.stiffness)
         scale, count = rest.scale[[0, 0, 1]], len(rows)
         size = np.sqrt((expected**2).mean(0))
         felt = size > BEYOND_NOISE * np.maximum(
@@ -229,7 +230,7 @@ class Judge:
         axis = self.plane.directions
         forces = reading.rows[:, 6:8] @ axis[:2]
         lever = rest.log.rotations.inv().apply(np.cross(forces, axis[2]))
-        expected = _spring(reading.rows[:, :3], reading.rows[:, 3:6], rest.stiffness)[:, 2]
+        expected = spring_wrench(reading.rows[:, :3], reading.rows[:, 3:6], rest.stiffness)[:, 2]
         moved, *_ = np.linalg.lstsq(lever, expected - reading.rows[:, 8], rcond=0.05)
         point = np.array(rest.wrench.point) + moved
         if np.linalg.norm(point) > FARTHEST_POINT:
@@ -246,7 +247,7 @@ class Judge:
 
     def remains(self, reading: Reading) -> Remains:
         """What w - K (x - u) is, by cause."""
-        expected = _spring(reading.rows[:, :3], reading.rows[:, 3:6], reading.stiffness)
+        expected = spring_wrench(reading.rows[:, :3], reading.rows[:, 3:6], reading.stiffness)
         return remains(reading.rows, expected, self.floor)
 
 
@@ -257,16 +258,6 @@ def _best(found: Sequence[Reading], count: int) -> list[Reading]:
 def _turned(rotations: Rotation) -> float:
     """Root mean square angle since the first one [rad]."""
     return _size((rotations * rotations[0].inv()).magnitude())
-
-
-def _spring(
-    poses: Float[np.ndarray, "k 3"],
-    commands: Float[np.ndarray, "k 3"],
-    stiffness: Float[np.ndarray, " 3"],
-) -> Float[np.ndarray, "k 3"]:
-    away = poses - commands
-    away[:, 2] = np.remainder(away[:, 2] + math.pi, 2 * math.pi) - math.pi
-    return stiffness * away
 
 
 def _size(values: np.ndarray) -> float:

@@ -31,7 +31,7 @@ from tpcd.logs.findings import (
     doubt,
     left_out,
     spiked,
-    spring_wrench,
+    spring_of,
     turned_out,
     zeroed_in_contact,
 )
@@ -147,7 +147,7 @@ def import_log(log: Log, choices: Importing) -> Imported:
         commands_known=settled.commands is not None,
         unusual=choices.unusual,
     )
-    extra, spring = _extra(log, settled), spring_wrench(settled, stiffness)
+    extra, spring = _extra(log, settled), spring_of(settled, stiffness)
     if settled.commands is None:
         content = Measured(settled.rows[:, :3], settled.rows[:, 3:], extra)
         nothing = doubt("commands", NO_SET_POINTS)
@@ -331,7 +331,7 @@ def _episode(
     assert settled.commands is not None and header.sensor_std is not None
     commands, rows = settled.commands.copy(), settled.rows.copy()
     stiffness = np.array(header.stiffness)
-    pressed = spring_wrench(settled, stiffness)[0]
+    pressed = spring_of(settled, stiffness)[0]
     begun = float(extra["time_s"][0])
     lost = sum(time < begun for time in (*settled.broken, *settled.unsettled))
     before = (

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tpcd.planar import spring_wrench
 from tpcd.quality.finding import Finding, Weight
 
 POSES = ("x", "z", "phi")
@@ -41,9 +42,7 @@ def check_repeats(
     `stiffness` [N/m, N/m, N·m/rad], `sensor_std` of x, z, phi, F_x, F_z, tau. Angles as far apart
     as a turn count as near.
     """
-    away = poses - commands
-    away[:, 2] = np.pi - np.remainder(np.pi - away[:, 2], 2.0 * np.pi)
-    expected = stiffness * away
+    expected = spring_wrench(poses, commands, stiffness)
     noise = BEYOND * np.hypot(sensor_std[3:], stiffness * sensor_std[:3]) + LEAST
     found: list[Finding] = []
     told = np.zeros(len(wrenches), dtype=bool)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tpcd.data.limits import WRENCH_COLUMNS
+from tpcd.quality.channels import listed_rows
 from tpcd.quality.finding import Finding, Weight
 from tpcd.robot.free_space import is_free
 from tpcd.robot.preflight import CERTAIN, TILT, FreeAir
@@ -125,12 +126,5 @@ class ZeroWatch:
 
 
 def _named(rows: list[int]) -> str:
-    """Row numbers as people write them: rows 3 to 7 and 9 are."""
-    runs: list[list[int]] = []
-    for row in rows:
-        if runs and runs[-1][-1] == row - 1:
-            runs[-1].append(row)
-        else:
-            runs.append([row])
-    shown = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
-    return f"row {shown[0]} is" if len(rows) == 1 else f"rows {', '.join(shown)} are"
+    shown = listed_rows(np.array(rows))
+    return f"row {shown} is" if len(rows) == 1 else f"rows {shown} are"

@@ -42,6 +42,8 @@ NOTHING_FELT = "K (x - u) is nowhere more than 1 N: no contact is felt"
 LARGE = 0.1
 """Part of the load of a channel below which it is arms and sensors as they are."""
 SENSOR_UNITS = ("m", "m", "rad", "N", "N", "N·m")
+SHOWN = (1.0, 1.0, 0.05)
+"""Changes of K (x - u) that friction of an arm does not hide [N, N, N·m]."""
 CHANNELS, UNITS = ("F_x", "F_z", "tau"), ("N", "N", "N·m")
 
 
@@ -185,8 +187,7 @@ def dead_channels(settled: Settled, stiffness: Float[np.ndarray, " 3"]) -> Accou
     if settled.commands is None or len(settled.rows) < 2:
         return None
     spring = np.ptp(spring_of(settled, stiffness), axis=0)
-    least = np.array([1.0, 1.0, 0.05])
-    dead = np.flatnonzero((np.ptp(settled.rows[:, 3:], axis=0) == 0) & (spring > least))
+    dead = np.flatnonzero((np.ptp(settled.rows[:, 3:], axis=0) == 0) & (spring > SHOWN))
     if not len(dead):
         return None
     told = "; ".join(

@@ -15,6 +15,7 @@ from tpcd.identification.quantity import Quantity
 from tpcd.logs.log import Log
 
 SECONDS = 60.0
+"""Of motion and contact in a recording: what a user records in one go [s]."""
 LOADED = ("weight", "force_bias", "torque_bias", "centre_of_mass", "sensor_rotation")
 SPRINGS = ("stiffness", "arm_friction")
 MOVING = {

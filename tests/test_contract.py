@@ -125,9 +125,15 @@ def test_what_is_no_pose_is_refused_in_one_line_that_says_what_is_expected(predi
 def test_a_row_that_is_not_finite_is_not_answered_and_a_noise_that_is_not_is_refused(predictor):
     found = predictor.predict([POSE, [0.0, np.nan, 0.0]], COMMAND)
     assert found.answered.tolist() == [True, False]
-    for name, std in (("pose_std", [1e-4, np.inf, 1e-4]), ("sensor_std", [-1.0] * 6)):
-        with pytest.raises(ValueError, match=f"{name} is .*expected"):
+    wrong = [
+        ("pose_std", [1e-4, np.inf, 1e-4], "pose_std is inf, expected a finite number"),
+        ("sensor_std", [-1.0] * 6, "sensor_std of x is -1, expected >= 0"),
+        ("pose_std", [0.1, 0.1, 5e-4], "pose_std of x is 0.1, expected m .*looks like mm"),
+    ]
+    for name, std, told in wrong:
+        with pytest.raises(ValueError, match=told):
             predictor.predict(POSE, COMMAND, **{name: std})
+    predictor.predict(POSE, COMMAND, pose_std=[0.1, 0.1, 5e-4], unusual=True)
 
 
 STEP_WRONG = {key: WRONG[key] for key in ("a number", "two numbers", "nothing", "words", "truths")}
@@ -192,6 +198,7 @@ def test_an_episode_takes_lists_and_arrays_and_refuses_other_shapes(episode: Epi
         ("commands", 1e3 * episode.commands, "commands reaches"),
         ("stiffness", [0.1, 0.1, 50.0], "N/mm; convert it, or insist with unusual=True"),
         ("sensor_std", [1e-3] * 5, "sensor_std has shape (5,), expected 6 numbers"),
+        ("sensor_std", [0.2, *[1e-3] * 5], "sensor_std of x is 0.2, expected m (at most 0.05)"),
     ):
         with pytest.raises((TypeError, ValueError)) as raised:
             Episode(**{**plain, name: value})
@@ -337,7 +344,7 @@ def test_an_outline_in_millimetres_is_refused_unless_the_caller_insists():
         ({"poses": (2, 1, np.nan)}, r"poses is nan at \[2, 1\], expected a finite number"),
         ({"wrenches": (1, 0, np.inf)}, r"wrenches is inf at \[1, 0\], expected a finite number"),
         ({"sensor_std": (3, np.nan)}, r"sensor_std is nan at 3|sensor_std is nan, expected"),
-        ({"sensor_std": (3, -0.3)}, "sensor_std is .*expected none below 0"),
+        ({"sensor_std": (3, -0.3)}, "sensor_std of F_x is -0.3, expected >= 0"),
     ],
 )
 def test_rows_that_nothing_can_be_learnt_from_are_named(episode: Episode, learn, change, told):

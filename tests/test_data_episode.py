@@ -130,7 +130,6 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path):
     wrenches[1, 2] = float("nan")
     bad = [
         replace(episode, wrenches=wrenches),
-        replace(episode, sensor_std=-episode.sensor_std),
         replace(episode, priors={"friction": (0.9, 0.1)}),
     ]
     for broken in bad:

@@ -27,6 +27,10 @@ COUNTED = "degrees, or turns that are counted on (wrap them to within pi)"
 LEAST_STIFFNESS, LARGEST_STIFFNESS = 10.0, 1e6
 """Springs of an arm [N/m]. Softer ones are taken for N/mm, in which arms have 0.03 to 5; no arm is
 stiffer."""
+LARGEST_NOISE = {"x": (0.05, "m", "mm"), "z": (0.05, "m", "mm"), "phi": (0.5, "rad", "degrees")}
+"""Noise of poses beyond this [m, rad] is taken for millimetres or degrees."""
+SENSOR_NAMES = ("x", "z", "phi", "F_x", "F_z", "tau")
+"""Channels of a recorded row, in the order of their noise."""
 LARGEST_TURNING_STIFFNESS = 1e4
 """The same about its axis [N·m/rad]; stiffer ones are taken for N·mm/rad."""
 LARGEST_AMOUNTS = {
@@ -101,6 +105,22 @@ def check_pose(name: str, value: Float[Tensor, "*batch 3"], unusual: bool = Fals
     """Refuse poses or commands (x, z, angle) that are no metres and radians; ValueError."""
     check_lengths(name, value[..., :2], unusual)
     _check_largest(name, value[..., 2], LARGEST_ANGLE, "rad", COUNTED, unusual)
+
+
+def check_noise(name: str, std: Float[Tensor, " c"], unusual: bool = False) -> None:
+    """Refuse standard deviations of the first channels of a row (x, z, phi, ...) that are negative
+    or not finite or that, unless `unusual`, look like another unit; ValueError names the channel.
+    """
+    check_finite(name, std)
+    for channel, value in zip(SENSOR_NAMES, std.tolist(), strict=False):
+        largest, unit, likely = LARGEST_NOISE.get(channel, (math.inf, "", ""))
+        if value < 0:
+            raise ValueError(f"{name} of {channel} is {value:g}, expected >= 0")
+        if value > largest and not unusual:
+            raise ValueError(
+                f"{name} of {channel} is {value:g}, expected {unit} (at most {largest:g}); it looks"
+                f" like {likely}: give it in {unit}"
+            )
 
 
 def _check_largest(

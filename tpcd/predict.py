@@ -19,7 +19,7 @@ from tpcd.belief.belief import Belief
 from tpcd.belief.misfit import misfit_rows
 from tpcd.belief.resampling import systematic_resample
 from tpcd.contact import ContactScene, column_scene, scene_from_parameters
-from tpcd.contract import as_numbers, check_finite, check_pose
+from tpcd.contract import as_numbers, check_noise, check_pose
 from tpcd.effects.conditions import Rows, sequence
 from tpcd.effects.simulate import RowByRow, SimulatedRows, simulate_rows
 from tpcd.planar import wrap_angle
@@ -85,7 +85,7 @@ class ContactPredictor:
         without, of what will truly be. `keep_field` asks for `Prediction.component_field`.
         """
         pose, command, previous = _asked(pose, command, previous, unusual)
-        start_variance = _variance("pose_std", pose_std, 3)
+        start_variance = _variance("pose_std", pose_std, 3, unusual)
         found = None
         gap = self._gap(self._field_mean[:, None], command[:, 2])
         if self._added.effects:
@@ -129,7 +129,7 @@ class ContactPredictor:
             wrench = found.wrench + (found.matrix @ moved[..., None])[..., 0]
             wrench = torch.where(keep, wrench, 0.0)
         identity = torch.eye(3, dtype=torch.float64)
-        sensor = _variance("sensor_std", sensor_std, 6)
+        sensor = _variance("sensor_std", sensor_std, 6, unusual)
         return Prediction(
             command=command,
             stiffness=self.belief.stiffness,
@@ -294,14 +294,12 @@ def _asked(
     return rows[0], rows[1], rows[2] if len(rows) > 2 else None
 
 
-def _variance(name: str, std: Any, count: int) -> Float[Tensor, " c"]:
+def _variance(name: str, std: Any, count: int, unusual: bool) -> Float[Tensor, " c"]:
     """The variances of so many channels with the given standard deviation; zeros for None."""
     if std is None:
         return torch.zeros(count, dtype=torch.float64)
     found = as_numbers(name, std, count, axes=1, device=torch.device("cpu")).double()
-    check_finite(name, found)
-    if bool((found < 0).any()):
-        raise ValueError(f"{name} is {found.tolist()}, expected no negative number")
+    check_noise(name, found, unusual)
     return found**2
 
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tpcd.contract import SENSOR_NAMES
 from tpcd.data.doubts import doubts_told
 from tpcd.data.equilibrium import Rows, departure, misplaced
-from tpcd.data.header import SENSOR_NAMES
 from tpcd.data.limits import (
     COMMAND_COLUMNS,
     POSE_COLUMNS,

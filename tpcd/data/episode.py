@@ -14,7 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.contract import as_numbers, check_finite, check_pose, check_prior, check_stiffness
+from tpcd.contract import (
+    as_numbers,
+    check_finite,
+    check_noise,
+    check_pose,
+    check_prior,
+    check_stiffness,
+)
 from tpcd.data.limits import COMMAND_COLUMNS, POSE_COLUMNS, WRENCH_COLUMNS
 from tpcd.parameters import SCENE_NAMES, SCENE_UNITS
 from tpcd.quality.finding import Finding
@@ -66,6 +73,7 @@ class Episode:
             if tuple(value.shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {shape}")
         check_stiffness(self.stiffness, self.unusual)
+        check_noise("sensor_std", self.sensor_std, self.unusual)
         for name in ("commands", "poses"):
             check_pose(name, getattr(self, name), self.unusual)
         for name, column in self.extra.items():
@@ -77,10 +85,8 @@ class Episode:
         """Refuse rows, noise and priors that nothing can be learnt from; ValueError names them."""
         if len(self) == 0:
             raise ValueError("the episode has no rows, expected one of the start pose at least")
-        for name in ("commands", "poses", "wrenches", "sensor_std"):
+        for name in ("commands", "poses", "wrenches"):
             check_finite(name, getattr(self, name))
-        if bool((self.sensor_std < 0).any()):
-            raise ValueError(f"sensor_std is {self.sensor_std.tolist()}, expected none below 0")
         for name, unit in zip(SCENE_NAMES, SCENE_UNITS, strict=True):
             if name in self.priors:
                 check_prior(name, self.priors[name], unit, self.unusual)

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from tpcd.contract import check_prior, check_stiffness
+from tpcd.contract import check_noise, check_prior, check_stiffness
 from tpcd.data.doubts import encode_doubts, parse_doubts
 from tpcd.errors import EpisodeError
 from tpcd.numerals import NUMBER
@@ -29,14 +29,11 @@ KEYS = (
     *("stiffness", "sensor_std", "object", "notes", "time_step_s", "priors", "commands"),
     *("unusual", "doubts"),
 )
-SENSOR_NAMES = ("x", "z", "phi", "F_x", "F_z", "tau")
 ESTIMATE_NOISE = (
     "hold the arm still without contact, record for about 10 s and give the standard deviation"
     " of x, z [m], phi [rad], F_x, F_z [N], tau [N·m], e.g."
     " sensor_std: [0.0002, 0.0002, 0.0005, 0.3, 0.3, 0.02]"
 )
-LARGEST_NOISE = {"x": (0.05, "m", "mm"), "z": (0.05, "m", "mm"), "phi": (0.5, "rad", "degrees")}
-"""Noise of poses beyond this [m, rad] is taken for millimetres or degrees."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,9 @@ def parse_header(content: Any, path: Path) -> Header:
     except ValueError as error:
         fault, _, remedy = str(error).partition("; ")
         raise EpisodeError(path, fault, remedy) from error
-    sensor_std = _sensor_std(path, content["sensor_std"]) if "sensor_std" in content else None
+    sensor_std = None
+    if "sensor_std" in content:
+        sensor_std = _sensor_std(path, content["sensor_std"], unusual)
     time_step = content.get("time_step_s")
     if time_step is not None:
         time_step = _number(path, "time_step_s", time_step)
@@ -141,23 +140,15 @@ def encode_header(header: Header) -> bytes:
     return to_yaml(content, flow=True).encode("utf-8")
 
 
-def _sensor_std(path: Path, value: Any) -> tuple[float, ...]:
+def _sensor_std(path: Path, value: Any, unusual: bool) -> tuple[float, ...]:
     sensor_std = _numbers(
         path, "sensor_std", value, 6, "[x, z, phi, F_x, F_z, tau]", ESTIMATE_NOISE
     )
-    for name, std in zip(SENSOR_NAMES, sensor_std, strict=True):
-        if std < 0:
-            raise EpisodeError(
-                path, f"sensor_std of {name} is {std:g}, expected >= 0", ESTIMATE_NOISE
-            )
-        largest, unit, likely = LARGEST_NOISE.get(name, (math.inf, "", ""))
-        if std > largest:
-            raise EpisodeError(
-                path,
-                f"sensor_std of {name} is {std:g}, expected {unit} (at most {largest:g}); it"
-                f" looks like {likely}",
-                f"give it in {unit}",
-            )
+    try:
+        check_noise("sensor_std", torch.tensor(sensor_std, dtype=torch.float64), unusual)
+    except ValueError as error:
+        fault, _, remedy = str(error).partition(": ")
+        raise EpisodeError(path, fault, remedy or ESTIMATE_NOISE) from error
     return tuple(sensor_std)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from tpcd.data.header import SENSOR_NAMES
+from tpcd.contract import SENSOR_NAMES
 from tpcd.errors import EpisodeError
 from tpcd.planar import short_way
 from tpcd.quality.finding import Finding, Weight

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tpcd.data.header import SENSOR_NAMES
+from tpcd.contract import SENSOR_NAMES
 from tpcd.logs.hypotheses import BEYOND_NOISE, LEAST_TURN, MISSED, WITHIN, Reading
 from tpcd.logs.log import Log, LogError
 from tpcd.logs.plane import PlanarLog

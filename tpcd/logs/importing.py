@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from tpcd.contract import check_stiffness
+from tpcd.contract import SENSOR_NAMES, check_stiffness
 from tpcd.data.checks import FREE_WRENCH, NOISE_FACTOR, episode_findings
 from tpcd.data.episode import Episode
 from tpcd.data.files import episode_contents
-from tpcd.data.header import SENSOR_NAMES, Header
+from tpcd.data.header import Header
 from tpcd.data.measured import Measured, measured_contents
 from tpcd.data.noise import check_noise
 from tpcd.errors import EpisodeError

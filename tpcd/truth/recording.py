@@ -16,10 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.contract import SENSOR_NAMES
 from tpcd.data.checks import NOISE_FACTOR, ROUNDING
 from tpcd.data.episode import Episode
 from tpcd.data.files import episode_contents, read_rows, write_together
-from tpcd.data.header import SENSOR_NAMES, Header
+from tpcd.data.header import Header
 from tpcd.data.table import row_name
 from tpcd.errors import EpisodeError
 from tpcd.plain_yaml import read_yaml, to_yaml

@@ -7,7 +7,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 INSTALLED := .venv/.installed
-EXTRAS := qpth,robot,bags,fast,dev
+EXTRAS := qpth,robot,bags,dev
 WORKERS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 

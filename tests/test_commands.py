@@ -260,20 +260,3 @@ def test_the_outline_in_the_scene_is_a_central_one() -> None:
     for weights, expected in (([1.0] * 5, 2), ([0.1, 0.1, 0.1, 0.1, 9.0], 4)):
         found = central_outline(outlines, torch.tensor(weights, dtype=torch.float64))
         torch.testing.assert_close(found, outlines[expected])
-
-
-@pytest.mark.parametrize("loops", [True, False])
-def test_whoever_lacks_the_compiled_loops_is_told_and_waits_less(
-    loops: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from tpcd.belief import settings
-    from tpcd.commands import estimation
-
-    for module in (settings, estimation):
-        monkeypatch.setattr(module, "available", lambda: loops)
-    full, closing = settings.CLOSING_SAMPLER, settings.EstimatorSettings().closing
-    assert closing == full if loops else 2 * closing.draws < full.draws
-    assert settings.SamplerSettings().scaled(0.0) == settings.SamplerSettings()
-    with estimation.EstimationRun(tmp_path, PRIOR, 5):
-        pass
-    assert ("pip install 'tpcd[fast]'" in capsys.readouterr().err) is not loops

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
-
-import pytest
-
-from tpcd import compile_ahead, loops
 
 # Counts what numba compiles or loads for an estimate that comes after.
 USE = """
@@ -22,12 +17,12 @@ from tpcd.effects.kernel_uneven import lay_range
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
-from tpcd.simulator import kernel, simulate_step
+from tpcd.simulator import batch, simulate_step
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
 
 compile_loops()
-loops = (kernel.step_range, filtered.explain_range, mixture_kernel.sum_range, lay_range)
+loops = (batch.step_range, filtered.explain_range, mixture_kernel.sum_range, lay_range)
 before = [len(loop.signatures) for loop in loops]
 generator = torch.Generator().manual_seed(1)
 scene = draw_scene("milk_carton", builtin_outlines()["milk_carton"].vertices, generator)
@@ -46,21 +41,7 @@ print(before, [len(loop.signatures) for loop in loops])
 
 
 def test_nothing_is_left_to_compile_for_an_estimate() -> None:
-    pytest.importorskip("numba")
     found = subprocess.run(
         [sys.executable, "-c", USE], capture_output=True, text=True, check=False, timeout=500
     )
     assert found.stdout.strip() == "[2, 2, 1, 1] [2, 2, 1, 1]", found.stderr
-
-
-def test_without_numba_there_is_nothing_to_compile(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    compile_ahead.compile_ahead(compile_ahead.CompileAhead())
-    assert "nothing to compile" in capsys.readouterr().out
-
-
-def test_a_numba_that_does_not_load_is_told_once_and_none(monkeypatch, capsys) -> None:
-    """As beside a NumPy that is too new for it."""
-    monkeypatch.setitem(sys.modules, "numba.core.caching", None)
-    assert loops.available.__wrapped__() is False
-    assert "numba is installed, but does not load" in capsys.readouterr().err

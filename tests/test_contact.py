@@ -6,8 +6,7 @@ import torch
 from contact_scenes import BOX, make_scene, outline_points, random_transitions, vector
 
 from tpcd.contact import ContactScene, contact_frame, place_points, terrain_gaps
-from tpcd.planar import rotate, transform_points
-from tpcd.simulator.lowest import lowest_points
+from tpcd.planar import rotate
 from tpcd.terrain import HalfPlane
 
 
@@ -87,18 +86,3 @@ class Slope:
 
     def gather(self, index):
         return Slope(self.plane.gather(index))
-
-
-def test_the_short_cut_for_half_planes_finds_the_same_points():
-    scene, start, command = random_transitions(outline_points("hammer"), 30, seed=3)
-    other = ContactScene(scene.points_ee, tuple(map(Slope, scene.terrains)), scene.friction)
-    leans = vector(0.0, 0.02, -0.3).expand(30, 2, 3)
-    for pose, since in ((start, None), (command, start)):
-        gap, index = lowest_points(scene, pose, leans, since)
-        slow_gap, slow_index = lowest_points(other, pose, leans, since)
-        torch.testing.assert_close(gap, slow_gap, atol=1e-12, rtol=0)
-        assert torch.equal(index, slow_index)
-    gap, index = lowest_points(scene, start, leans)
-    world = transform_points(start, scene.points_ee)
-    lowest = scene.terrains[0].signed_distance(world).amin(-1)
-    torch.testing.assert_close(gap[:, 0, 0], lowest, atol=1e-12, rtol=0)

@@ -288,12 +288,11 @@ def test_a_scene_takes_lists_and_arrays_and_what_broadcasts():
     wanted = simulate_step(make_scene(), POSE, COMMAND, STIFFNESS)
     for points, friction in ((BOX.tolist(), [0.4, 0.4]), (BOX.numpy(), np.full((3, 2), 0.4))):
         scene = ContactScene(points, make_scene().terrains, friction)
-        for engine in ("native", "torch"):
-            found = simulate_step(scene, POSE, COMMAND, STIFFNESS, engine=engine)
-            torch.testing.assert_close(found.pose, wanted.pose.expand_as(found.pose))
+        found = simulate_step(scene, POSE, COMMAND, STIFFNESS)
+        torch.testing.assert_close(found.pose, wanted.pose.expand_as(found.pose))
     several = make_scene(position=[0.3, 0.05, 0.02])
     scene = ContactScene(BOX, several.terrains, [0.4, 0.4])
-    found = simulate_step(scene, POSE, COMMAND, STIFFNESS, engine="torch")
+    found = simulate_step(scene, POSE, COMMAND, STIFFNESS)
     torch.testing.assert_close(found.pose, simulate_step(several, POSE, COMMAND, STIFFNESS).pose)
 
 
@@ -318,15 +317,14 @@ def test_what_is_no_scene_is_refused_in_one_line(change, kind, told):
     assert told in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("engine", ["native", "torch"])
 @pytest.mark.parametrize("length", [0.0, 0.5, 2.0])
-def test_a_terrain_whose_direction_is_no_unit_vector_has_no_answer(engine, length):
+def test_a_terrain_whose_direction_is_no_unit_vector_has_no_answer(length):
     terrains = HalfPlane(vector(0, length), vector(0.0)[0]), make_scene().terrains[1]
     scene = ContactScene(BOX, terrains, [0.4, 0.4])
-    found = simulate_step(scene, POSE, COMMAND, STIFFNESS, engine=engine)
+    found = simulate_step(scene, POSE, COMMAND, STIFFNESS)
     assert int(found.status) == StepStatus.INVALID_INPUT and found.pose.isnan().all()
     rounded = replace(scene, terrains=(HalfPlane(vector(0.001, 1.0), vector(0.0)[0]), terrains[1]))
-    found = simulate_step(rounded, POSE, COMMAND, STIFFNESS, engine=engine)
+    found = simulate_step(rounded, POSE, COMMAND, STIFFNESS)
     assert int(found.status) == StepStatus.CONVERGED
 
 

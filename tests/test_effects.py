@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tpcd.belief.filtered import HistoryLikelihood
+from tpcd.belief.filter import HistoryLikelihood
 from tpcd.belief.history import History, history_of
 from tpcd.belief.likelihood import history_likelihood
 from tpcd.belief.misfit import MisfitField
@@ -20,7 +20,7 @@ from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import QuasistaticTruth, StepSettings, native
+from tpcd.simulator import QuasistaticTruth, StepSettings
 from tpcd.terrain import floor, wall
 from tpcd.truth.recording import make_motion, record
 from tpcd.truth.scene import draw_scene, make_truth
@@ -95,25 +95,6 @@ def test_null_values_change_no_bit(
     effect: Effect, history: History, without: HistoryLikelihood
 ) -> None:
     found = likelihood_with(history, 6, (effect,))
-    assert torch.equal(found.total, without.total)
-    assert torch.equal(found.field_mean, without.field_mean)
-
-
-@pytest.mark.parametrize(
-    "effects",
-    [
-        KNOWN,
-        *(pytest.param((effect,), marks=pytest.mark.slow, id=effect.name) for effect in KNOWN),
-    ],
-    ids=lambda effects: "all at once",
-)
-def test_null_values_change_no_bit_in_the_torch_engine(
-    effects: tuple[Effect, ...], history: History, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is slow, so for three transitions: onto the floor, turning there, and to the wall."""
-    monkeypatch.setattr(native, "available", lambda: False)
-    history = history.using(torch.isin(torch.arange(len(history)), torch.tensor([1, 3, 7])))
-    without, found = (likelihood_with(history, 3, some) for some in ((), effects))
     assert torch.equal(found.total, without.total)
     assert torch.equal(found.field_mean, without.field_mean)
 

@@ -13,7 +13,6 @@ from tpcd.data.episode import Episode
 from tpcd.effects import CATALOGUE, DeclaredEffect, Effect, EffectParameter
 from tpcd.effects.protocol import Added
 from tpcd.errors import EffectError
-from tpcd.simulator import native
 
 
 @pytest.fixture(scope="module")
@@ -34,17 +33,11 @@ def rough(power: float, field: str = "friction") -> Effect:
     )
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("field", ["friction", "command", "stiffness", "normal", "bias"])
-def test_a_particle_without_an_answer_leaves_the_others_alone(
-    episode: Episode, compiled: bool, field: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not compiled:
-        monkeypatch.setattr(native, "available", lambda: False)
+def test_a_particle_without_an_answer_leaves_the_others_alone(episode: Episode, field: str) -> None:
     values = torch.tensor([-0.5, 1.0, 0.9, -0.1, 1.2, 1.0], dtype=torch.float64)[:, None]
     fine = values[:, 0] > 0
-    rows = episode if compiled else episode.first(3)
-    effect, history, draws = rough(0.5, field), history_of(rows), draws_of(6)
+    effect, history, draws = rough(0.5, field), history_of(episode), draws_of(6)
     # A second effect looks at what the first one left behind.
     pair = (effect, CATALOGUE[0])
     values = torch.cat((values, torch.full_like(values, 2e-4)), dim=1)

@@ -30,7 +30,7 @@ from tpcd.files import to_plain
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
-from tpcd.simulator import StepSettings, native
+from tpcd.simulator import StepSettings
 
 STIFFNESS = torch.tensor([100.0, 100.0, 50.0], dtype=torch.float64)
 BOX = torch.tensor([[-0.05, 0.0], [0.05, 0.0], [0.05, 0.1], [-0.05, 0.1]]).double()
@@ -64,12 +64,7 @@ def test_the_example_of_the_docs_is_a_model(folder: Path) -> None:
     assert "beyond 50 mm" in model.effects[0].sentence(["-0.7", "50 mm"])
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_the_example_changes_no_bit_at_its_null_values(
-    wet: Effect, episode: Episode, compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not compiled:
-        monkeypatch.setattr(native, "available", lambda: False)
+def test_the_example_changes_no_bit_at_its_null_values(wet: Effect, episode: Episode) -> None:
     null = torch.tensor([[p.null for p in wet.parameters]], dtype=torch.float64)
     draws, history = draws_of(6), history_of(episode)
     found = likelihood(history, draws, Added((wet,), null.expand(6, -1)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tpcd.simulator import native
+from tpcd.threads import over_threads
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -16,7 +16,7 @@ def test_every_row_is_worked_on_once_and_in_order(
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
     rows = torch.arange(count, dtype=torch.float64)[:, None].requires_grad_()
-    parts = native.over_threads(lambda own: 2 * own, rows, most)
+    parts = over_threads(lambda own: 2 * own, rows, most)
     found = torch.cat(parts)
     assert torch.equal(found, 2 * rows.detach()) and not found.requires_grad
     assert most is None or max(len(part) for part in parts) <= most

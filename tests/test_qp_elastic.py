@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from scipy.optimize import minimize
 
@@ -12,10 +11,7 @@ from tpcd.qp import ContactQP, Status, solve
 from tpcd.qp.elastic import RELAXATION, relax
 from tpcd.qp.problem import select
 
-ENGINES = ("exact", "native")
 JAMMING = ContactRecipe(friction=(1.1, 1.6), gaps=(-0.003, 0.001), wall_share=0.5)
-
-pytestmark = pytest.mark.parametrize("engine", ENGINES)
 
 
 def opposed(gap: float) -> ContactQP:
@@ -26,8 +22,8 @@ def opposed(gap: float) -> ContactQP:
     return ContactQP(hessian, torch.zeros(1, dtype=torch.float64), rows, offsets)
 
 
-def test_two_walls_that_overlap_share_the_penetration(engine):
-    solution = solve(opposed(-0.002), engine)
+def test_two_walls_that_overlap_share_the_penetration():
+    solution = solve(opposed(-0.002))
     assert solution.status == Status.RELAXED
     compliance = RELAXATION / 100.0
     # Springs of 1/c on both sides of the point and K = 100 N/m towards 0.
@@ -37,21 +33,21 @@ def test_two_walls_that_overlap_share_the_penetration(engine):
     torch.testing.assert_close(solution.multipliers, forces, rtol=1e-10, atol=0)
 
 
-def test_without_the_fallback_infeasible_elements_are_marked_and_not_answered(engine):
-    solution = solve(opposed(-0.002), engine, elastic=False)
+def test_without_the_fallback_infeasible_elements_are_marked_and_not_answered():
+    solution = solve(opposed(-0.002), elastic=False)
     assert solution.status == Status.INFEASIBLE
     assert solution.motion.isnan().all() and solution.residual.isnan()
 
 
-def test_walls_that_just_touch_are_feasible(engine):
-    solution = solve(opposed(0.0), engine)
+def test_walls_that_just_touch_are_feasible():
+    solution = solve(opposed(0.0))
     assert solution.status == Status.SOLVED
     assert solution.motion.item() == 0.0
 
 
-def test_jammed_contacts_get_finite_answers_that_satisfy_the_relaxed_conditions(engine):
+def test_jammed_contacts_get_finite_answers_that_satisfy_the_relaxed_conditions():
     problem = random_contact_problems(2000, 12, 0, JAMMING)
-    solution = solve(problem, engine)
+    solution = solve(problem)
     jammed = solution.status == Status.RELAXED
     assert 100 < jammed.sum() < 2000
     assert (solution.solved | jammed).all()
@@ -69,9 +65,9 @@ def test_jammed_contacts_get_finite_answers_that_satisfy_the_relaxed_conditions(
     assert ((force - pushed) / scale).abs().max() < 1e-11
 
 
-def test_the_compromise_minimises_motion_and_squared_violation_together(engine):
+def test_the_compromise_minimises_motion_and_squared_violation_together():
     problem = random_contact_problems(300, 8, 1, JAMMING)
-    solution = solve(problem, engine)
+    solution = solve(problem)
     assert 5 < int((solution.status == Status.RELAXED).sum()) < 95
     root = problem.hessian.diagonal().sqrt()
     whitened = problem.rows / root
@@ -92,7 +88,7 @@ def test_the_compromise_minimises_motion_and_squared_violation_together(engine):
         assert cost(ours) < min(cost(target), cost(0 * target))
 
 
-def test_the_answer_is_continuous_in_the_penetration(engine):
+def test_the_answer_is_continuous_in_the_penetration():
     depths = torch.linspace(-0.004, -1e-5, 400, dtype=torch.float64)
     single = opposed(-0.001)
     batch = ContactQP(
@@ -101,12 +97,12 @@ def test_the_answer_is_continuous_in_the_penetration(engine):
         single.rows.expand(400, 2, 1),
         torch.stack((torch.zeros_like(depths), depths), -1),
     )
-    solution = solve(batch, engine)
+    solution = solve(batch)
     assert (solution.status == Status.RELAXED).all()
     assert solution.motion.diff(dim=0).abs().max() < 1.1 * 0.5 * depths.diff().max()
 
 
-def test_units_do_not_matter_to_the_compromise(engine):
+def test_units_do_not_matter_to_the_compromise():
     problem = random_contact_problems(200, 8, 2, JAMMING)
     scaled = ContactQP(
         problem.hessian * 1e4,
@@ -115,25 +111,25 @@ def test_units_do_not_matter_to_the_compromise(engine):
         problem.offsets * 50.0 * 1e-3,
         row_mask=problem.row_mask,
     )
-    first, second = solve(problem, engine), solve(scaled, engine)
+    first, second = solve(problem), solve(scaled)
     assert torch.equal(first.status, second.status) and (first.status == Status.RELAXED).any()
     torch.testing.assert_close(second.motion * 1e3, first.motion, rtol=1e-7, atol=1e-10)
 
 
-def test_an_impossible_row_without_direction_leaves_the_motion_alone(engine):
+def test_an_impossible_row_without_direction_leaves_the_motion_alone():
     target = torch.tensor([0.1, 0.2], dtype=torch.float64)
     rows = torch.zeros(1, 2, dtype=torch.float64)
     problem = ContactQP(torch.eye(2, dtype=torch.float64), target, rows, -rows[:, 0] - 1.0)
-    solution = solve(problem, engine)
+    solution = solve(problem)
     assert solution.status == Status.RELAXED
     torch.testing.assert_close(solution.motion, target, rtol=0, atol=1e-14)
 
 
-def test_the_compiled_solver_agrees_with_the_door(engine):
-    from tpcd.qp.compiled import solve_whitened_3
+def test_the_compiled_solver_agrees_with_the_door():
+    from tpcd.qp.active_set import solve_whitened_3
 
     problem = random_contact_problems(100, 8, 3, JAMMING)
-    solution = solve(problem, engine)
+    solution = solve(problem)
     assert 5 < int((solution.status == Status.RELAXED).sum()) < 95
     root = problem.hessian.diagonal().sqrt().numpy()
     for element in range(100):

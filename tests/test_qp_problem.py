@@ -78,22 +78,19 @@ def test_two_devices_are_refused():
         check_problem(unchecked(problem(), offsets=torch.zeros(2, 4, device="meta").double()))
 
 
-def test_an_unknown_engine_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="auto, exact, native, qpth"):
-        solve(problem(), engine="osqp")
+def test_an_unknown_backend_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match="native, qpth"):
+        solve(problem(), "osqp")
 
 
-def test_a_missing_engine_says_how_to_get_it(monkeypatch):
+def test_a_missing_backend_says_how_to_get_it(monkeypatch):
     def find_nothing(name: str) -> None:
         return None
 
-    monkeypatch.setattr(import_module("tpcd.qp.qpth_engine"), "find_spec", find_nothing)
-    monkeypatch.setattr(import_module("tpcd.qp.solve"), "available", lambda: False)
+    monkeypatch.setattr(import_module("tpcd.qp.qpth_backend"), "find_spec", find_nothing)
     with pytest.raises(SolverError, match=r"tpcd\[qpth\]"):
-        solve(problem(), engine="qpth")
-    with pytest.raises(SolverError, match=r"tpcd\[fast\]"):
-        solve(problem(), engine="native")
-    assert solve(problem(), engine="auto").solved.all()
+        solve(problem(), "qpth")
+    assert solve(problem()).solved.all()
 
 
 def test_every_status_has_its_own_sentence():

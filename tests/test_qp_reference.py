@@ -15,7 +15,6 @@ from scipy.optimize import nnls
 from eval.bench.contact_problems import ContactRecipe, random_contact_problems
 from tpcd.qp import ContactQP, Status, solve
 
-ENGINES = ("exact", "native")
 MIXED = ContactRecipe()
 JAMMING = ContactRecipe(friction=(0.1, 1.6), gaps=(-0.002, 0.004), stiffness_decades=1.0)
 
@@ -95,9 +94,9 @@ def enumerated_force(problem: ContactQP, element: int) -> np.ndarray | None:
     return best
 
 
-def forces(problem: ContactQP, engine: str) -> tuple[np.ndarray, np.ndarray]:
+def forces(problem: ContactQP) -> tuple[np.ndarray, np.ndarray]:
     """Forces by motion and by multipliers, which must agree wherever solved."""
-    solution = solve(problem, engine, elastic=False)
+    solution = solve(problem, elastic=False)
     step = solution.motion - problem.target
     hessian = problem.hessian.expand(*problem.batch_shape, *problem.hessian.shape[-2:])
     by_motion = (hessian @ step[..., None])[..., 0]
@@ -113,26 +112,24 @@ def test_forces_match_daqp_on_ten_thousand_problems(recipe):
     wrong, worst, infeasible = 0, 0.0, 0
     for rows, seed in ((4, 1), (8, 2), (12, 3), (16, 4)):
         problem = random_contact_problems(2500, rows, seed, recipe)
-        answers = [forces(problem, engine) for engine in ENGINES]
+        force, status = forces(problem)
         for element in range(2500):
             expected = daqp_force(problem, element)
             infeasible += expected is None
-            for force, status in answers:
-                if expected is None:
-                    wrong += status[element] != Status.INFEASIBLE
-                else:
-                    error = np.abs(force[element] - expected).max()
-                    worst = max(worst, error)
-                    wrong += status[element] != Status.SOLVED or not error < 1e-8
+            if expected is None:
+                wrong += status[element] != Status.INFEASIBLE
+            else:
+                error = np.abs(force[element] - expected).max()
+                worst = max(worst, error)
+                wrong += status[element] != Status.SOLVED or not error < 1e-8
     assert wrong == 0, worst
     assert worst < 1e-8
     assert (infeasible > 0) == (recipe is JAMMING)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_forces_match_the_best_of_all_active_sets(engine):
+def test_forces_match_the_best_of_all_active_sets():
     problem = random_contact_problems(120, 8, 5, JAMMING)
-    force, status = forces(problem, engine)
+    force, status = forces(problem)
     for element in range(120):
         expected = enumerated_force(problem, element)
         if expected is None:
@@ -147,25 +144,23 @@ def test_forces_match_clarabel_on_ten_thousand_problems(recipe):
     wrong, worst, compared, solvable = 0, 0.0, 0, 0
     for rows, seed in ((4, 6), (8, 7), (12, 8), (16, 9)):
         problem = random_contact_problems(2500, rows, seed, recipe)
-        answers = [forces(problem, engine) for engine in ENGINES]
-        feasible = answers[0][1] == Status.SOLVED
+        force, status = forces(problem)
+        feasible = status == Status.SOLVED
         solvable += int(feasible.sum())
         for element in np.flatnonzero(feasible):
             expected = clarabel_force(problem, int(element))
             if expected is None:
                 continue
             compared += 1
-            for force, status in answers:
-                error = np.abs(force[element] - expected).max()
-                worst = max(worst, error)
-                wrong += status[element] != Status.SOLVED or not error < 1e-8
+            error = np.abs(force[element] - expected).max()
+            worst = max(worst, error)
+            wrong += status[element] != Status.SOLVED or not error < 1e-8
     assert wrong == 0, worst
     assert compared > 0.999 * solvable > 9000
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("n", "m"), [(1, 3), (2, 5), (6, 10), (6, 24), (7, 3)])
-def test_any_number_of_variables_matches_daqp(engine, n, m):
+def test_any_number_of_variables_matches_daqp(n, m):
     generator = torch.Generator().manual_seed(n * 100 + m)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -174,7 +169,7 @@ def test_any_number_of_variables_matches_daqp(engine, n, m):
     root = draw(n, n)
     hessian = root @ root.mT + 0.1 * torch.eye(n, dtype=torch.float64)
     problem = ContactQP(hessian, draw(n), draw(m, n), draw(m) + 0.5)
-    force, status = forces(problem, engine)
+    force, status = forces(problem)
     for element in range(150):
         expected = daqp_force(problem, element)
         if expected is None:
@@ -185,61 +180,56 @@ def test_any_number_of_variables_matches_daqp(engine, n, m):
             np.testing.assert_allclose(force[element] / scale, expected / scale, atol=1e-9)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_box_pressed_on_the_floor_is_carried_by_its_two_corners(engine):
+def test_a_box_pressed_on_the_floor_is_carried_by_its_two_corners():
     # Command 3 mm below a flat face of half width 0.04 m, turned by 0.01 rad: the corners
     # share K_z 3 mm, and their difference balances K_phi 0.01 rad where it does not tip.
     half, stiffness = 0.04, torch.diag(torch.tensor([100.0, 100.0, 0.5], dtype=torch.float64))
     target = torch.tensor([0.0, -0.003, 0.01], dtype=torch.float64)
     rows = torch.tensor([[0.0, 1.0, half], [0.0, 1.0, -half]], dtype=torch.float64)
-    solution = solve(ContactQP(stiffness, target, rows, rows.new_zeros(2)), engine)
+    solution = solve(ContactQP(stiffness, target, rows, rows.new_zeros(2)))
     total, difference = 100.0 * 0.003, 0.5 * 0.01 / half
     expected = torch.tensor([total - difference, total + difference], dtype=torch.float64) / 2
     torch.testing.assert_close(solution.multipliers, expected, rtol=1e-12, atol=0)
     torch.testing.assert_close(solution.motion, torch.zeros_like(target), rtol=0, atol=1e-16)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("friction", [0.2, 0.7, 1.5])
-def test_a_point_dragged_along_the_floor_feels_the_cone(engine, friction):
+def test_a_point_dragged_along_the_floor_feels_the_cone(friction):
     # Convex friction: the force lies on the cone edge, tangential = friction * normal.
     stiffness = 100.0 * torch.eye(2, dtype=torch.float64)
     target = torch.tensor([0.05, -0.004], dtype=torch.float64)
     rows = torch.tensor([[friction, 1.0], [-friction, 1.0]], dtype=torch.float64)
-    solution = solve(ContactQP(stiffness, target, rows, rows.new_zeros(2)), engine)
+    solution = solve(ContactQP(stiffness, target, rows, rows.new_zeros(2)))
     force = stiffness @ (solution.motion - target)
     normal = 100.0 * (0.004 + friction * 0.05) / (1 + friction**2)
     expected = torch.tensor([-friction * normal, normal], dtype=torch.float64)
     torch.testing.assert_close(force, expected, rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_corner_between_floor_and_wall_stays_put(engine):
+def test_a_corner_between_floor_and_wall_stays_put():
     stiffness = 100.0 * torch.eye(2, dtype=torch.float64)
     target = torch.tensor([0.01, -0.02], dtype=torch.float64)
     rows = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)
-    solution = solve(ContactQP(stiffness, target, rows, rows.new_zeros(2)), engine)
+    solution = solve(ContactQP(stiffness, target, rows, rows.new_zeros(2)))
     torch.testing.assert_close(solution.motion, torch.zeros_like(target), rtol=0, atol=1e-16)
     expected = torch.tensor([2.0, 1.0], dtype=torch.float64)
     torch.testing.assert_close(solution.multipliers, expected, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("compliance", [0.0, 1e-6, 1e-3, 0.1])
-def test_a_compliant_row_is_a_spring_in_series(engine, compliance):
+def test_a_compliant_row_is_a_spring_in_series(compliance):
     # 100 N/m of impedance in series with 1/compliance, pressed 5 mm beyond the surface.
     hessian = torch.tensor([[100.0]], dtype=torch.float64)
     one = torch.ones(1, dtype=torch.float64)
     problem = ContactQP(hessian, -0.005 * one, one[:, None], 0 * one, compliance * one)
-    solution = solve(problem, engine)
+    solution = solve(problem)
     expected = 0.005 / (1 / 100.0 + compliance)
     torch.testing.assert_close(solution.multipliers, expected * one, rtol=1e-12, atol=0)
     depth = -compliance * expected * one
     torch.testing.assert_close(solution.motion, depth, rtol=1e-9, atol=1e-18)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_compliant_problems_match_daqp_with_one_spring_variable_for_each_row(engine):
+def test_compliant_problems_match_daqp_with_one_spring_variable_for_each_row():
     rigid = random_contact_problems(300, 8, 7, MIXED)
     m = rigid.row_count
     generator = torch.Generator().manual_seed(8)
@@ -247,7 +237,7 @@ def test_compliant_problems_match_daqp_with_one_spring_variable_for_each_row(eng
     soft = ContactQP(
         rigid.hessian, rigid.target, rigid.rows, rigid.offsets, compliance, rigid.row_mask
     )
-    solution = solve(soft, engine)
+    solution = solve(soft)
     assert solution.solved.all()
     spring = torch.diag_embed(compliance.sqrt())
     wide = ContactQP(

@@ -1,4 +1,4 @@
-"""Closed forms of contacts with floor and wall, for both engines."""
+"""Closed forms of contacts with floor and wall."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from contact_scenes import (
     scene_wall,
     vector,
 )
-from simulator_steps import CLOSE, ENGINES, FRICTIONS, SIDES, assert_near, step
+from simulator_steps import CLOSE, FRICTIONS, SIDES, assert_near, step
 
 from tpcd.contact import ContactScene
 from tpcd.planar import rotate, transform_points
@@ -28,74 +28,67 @@ from tpcd.terrain import HalfPlane, floor, wall
 # One contact
 
 
-@ENGINES
 @FRICTIONS
-def test_a_box_pressed_on_the_floor_feels_stiffness_times_depth(engine, friction_law):
+def test_a_box_pressed_on_the_floor_feels_stiffness_times_depth(friction_law):
     scene = make_scene(height=0.01)
-    result = step(scene, vector(0, 0.1, 0), vector(0, 0.02, 0), engine, friction=friction_law)
+    result = step(scene, vector(0, 0.1, 0), vector(0, 0.02, 0), friction=friction_law)
     assert_near(result.pose, 0, 0.06, 0)
     assert_near(result.wrench, 0, 4.0, 0, atol=1e-7)
     assert result.mode.tolist() == [ContactMode.STICK, ContactMode.FREE]
 
 
-@ENGINES
 @FRICTIONS
-def test_a_box_pressed_on_the_wall_feels_stiffness_times_depth(engine, friction_law):
+def test_a_box_pressed_on_the_wall_feels_stiffness_times_depth(friction_law):
     scene = make_scene(position=0.1)
-    result = step(scene, vector(0, 0.1, 0), vector(0.09, 0.1, 0), engine, friction=friction_law)
+    result = step(scene, vector(0, 0.1, 0), vector(0.09, 0.1, 0), friction=friction_law)
     assert_near(result.pose, 0.07, 0.1, 0)
     assert_near(result.wrench, -2.0, 0, 0, atol=1e-7)
     assert result.mode.tolist() == [ContactMode.FREE, ContactMode.STICK]
 
 
-@ENGINES
 @SIDES
 @pytest.mark.parametrize("mu", [0.1, 0.4, 0.9])
-def test_a_sliding_slab_feels_friction_times_the_normal_force_against_its_motion(engine, mu, side):
+def test_a_sliding_slab_feels_friction_times_the_normal_force_against_its_motion(mu, side):
     scene = make_scene(SLAB, friction=mu)
-    result = step(scene, vector(0, 0.02, 0), vector(0.06 * side, -0.03, 0), engine)
+    result = step(scene, vector(0, 0.02, 0), vector(0.06 * side, -0.03, 0))
     assert_near(result.wrench, -side * mu * 5.0, 5.0, 0, atol=1e-7)
     assert_near(result.pose, side * (0.06 - mu * 5.0 / 100), 0.02, 0)
     slip = ContactMode.SLIP_POSITIVE if side > 0 else ContactMode.SLIP_NEGATIVE
     assert result.mode.tolist() == [slip, ContactMode.FREE]
 
 
-@ENGINES
 @SIDES
-def test_along_the_wall_friction_opposes_the_slip_too(engine, side):
+def test_along_the_wall_friction_opposes_the_slip_too(side):
     scene = make_scene(SLAB.flip(-1).flip(0), friction=0.3, position=0.02)
-    result = step(scene, vector(0, 0.5, 0), vector(0.04, 0.5 + 0.05 * side, 0), engine)
+    result = step(scene, vector(0, 0.5, 0), vector(0.04, 0.5 + 0.05 * side, 0))
     assert_near(result.wrench, -4.0, -side * 0.3 * 4.0, 0, atol=1e-7)
     slip = ContactMode.SLIP_POSITIVE if side > 0 else ContactMode.SLIP_NEGATIVE
     assert result.mode.tolist() == [ContactMode.FREE, slip]
 
 
-@ENGINES
 @FRICTIONS
 @SIDES
-def test_a_command_within_the_friction_cone_moves_nothing(engine, friction_law, side):
+def test_a_command_within_the_friction_cone_moves_nothing(friction_law, side):
     command = vector(0.015 * side, 0, 0)
-    result = step(make_scene(), vector(0, 0.05, 0), command, engine, friction=friction_law)
+    result = step(make_scene(), vector(0, 0.05, 0), command, friction=friction_law)
     # The tangential force at the foot turns the box only where its torque tips it.
     assert_near(result.pose, 0, 0.05, 0)
     assert_near(result.wrench, -1.5 * side, 5.0, 0, atol=1e-7)
     assert int(result.mode[0]) == ContactMode.STICK
 
 
-@ENGINES
-def test_without_friction_the_tangential_force_vanishes(engine):
+def test_without_friction_the_tangential_force_vanishes():
     scene = make_scene(SLAB, friction=0.0)
-    result = step(scene, vector(0, 0.02, 0), vector(0.05, -0.01, 0), engine)
+    result = step(scene, vector(0, 0.02, 0), vector(0.05, -0.01, 0))
     assert_near(result.pose, 0.05, 0.02, 0)
     assert_near(result.wrench, 0, 3.0, 0, atol=1e-7)
 
 
-@ENGINES
 @FRICTIONS
-def test_a_point_contact_gives_the_torque_of_its_lever(engine, friction_law):
+def test_a_point_contact_gives_the_torque_of_its_lever(friction_law):
     wedge = vector([0.04, -0.05], [0.05, 0.05], [-0.05, 0.05])
     scene = make_scene(wedge, friction=0.5)
-    result = step(scene, vector(0, 0.06, 0), vector(0, 0.01, 0), engine, friction=friction_law)
+    result = step(scene, vector(0, 0.06, 0), vector(0, 0.01, 0), friction=friction_law)
     arm = rotate(result.pose[2], wedge[0])
     force = result.wrench[:2]
     assert abs(float(result.pose[1] + arm[1])) < CLOSE
@@ -104,22 +97,19 @@ def test_a_point_contact_gives_the_torque_of_its_lever(engine, friction_law):
     assert float(result.wrench[2]) > 0.05
 
 
-@ENGINES
 @SIDES
-def test_a_torque_beyond_half_the_width_times_the_load_tips_the_box(engine, side):
+def test_a_torque_beyond_half_the_width_times_the_load_tips_the_box(side):
     load, width = 4.0, 0.03
     flat = step(
         make_scene(friction=0.0),
         vector(0, 0.05, 0),
         vector(0, 0.05 - load / 100, side * 0.99 * load * width / 50),
-        engine,
     )
     assert_near(flat.pose, 0, 0.05, 0)
     tipped = step(
         make_scene(friction=0.0),
         vector(0, 0.05, 0),
         vector(0, 0.05 - load / 100, side * 2.0 * load * width / 50),
-        engine,
     )
     assert side * float(tipped.pose[2]) > 1e-3
     corner = transform_points(tipped.pose, BOX)
@@ -129,31 +119,28 @@ def test_a_torque_beyond_half_the_width_times_the_load_tips_the_box(engine, side
 # Floor and wall
 
 
-@ENGINES
-def test_in_the_corner_each_terrain_bears_its_own_axis(engine):
+def test_in_the_corner_each_terrain_bears_its_own_axis():
     scene = make_scene(friction=0.0, position=0.05)
-    result = step(scene, vector(0, 0.06, 0), vector(0.05, 0.02, 0), engine)
+    result = step(scene, vector(0, 0.06, 0), vector(0.05, 0.02, 0))
     assert_near(result.pose, 0.02, 0.05, 0)
     assert_near(result.wrench, -3.0, 3.0, 0, atol=1e-7)
     assert ContactMode.FREE not in result.mode.tolist()
 
 
-@ENGINES
 @pytest.mark.parametrize("mu", [1.2, 1.5])
-def test_a_box_jammed_between_floor_and_wall_is_answered_without_friction(engine, mu):
+def test_a_box_jammed_between_floor_and_wall_is_answered_without_friction(mu):
     scene = make_scene(friction=mu, position=0.025)
     arguments = (vector(0, 0.045, 0), vector(0.01, 0.02, 0), STIFFNESS, StepSettings())
-    result = simulate_step(scene, *arguments, engine)
-    free = simulate_step(make_scene(friction=0.0, position=0.025), *arguments, engine)
+    result = simulate_step(scene, *arguments)
+    free = simulate_step(make_scene(friction=0.0, position=0.025), *arguments)
     assert int(result.status) == StepStatus.RELAXED
     torch.testing.assert_close(result.pose, free.pose, atol=1e-8, rtol=0)
     assert_near(result.pose, -0.005, 0.05, 0, atol=1e-8)
 
 
-@ENGINES
 @SIDES
 @pytest.mark.parametrize("mu", [0.6, 1.2, 2.0])
-def test_a_disc_that_is_turned_in_a_corner_slips_on_both_terrains(engine, mu, side):
+def test_a_disc_that_is_turned_in_a_corner_slips_on_both_terrains(mu, side):
     """However rough they are: the law would also let it hold, by forces of thousands of newtons
     between floor and wall that nothing presses it with. Closed form of Coulomb friction."""
     radius, turn = 0.04, 0.12
@@ -166,7 +153,7 @@ def test_a_disc_that_is_turned_in_a_corner_slips_on_both_terrains(engine, mu, si
     # The arm presses with 5 N on the terrain that friction draws the disc away from.
     right, down = (5.0, 1.0) if side > 0 else (1.0, 5.0)
     command = start + vector(right / 100, -down / 100, side * turn)
-    result = step(scene, start, command, engine)
+    result = step(scene, start, command)
     on_floor = (down + side * mu * right) / (1 + mu**2)
     on_wall = (right - side * mu * down) / (1 + mu**2)
     torque = mu * radius * (on_floor + on_wall)
@@ -176,15 +163,14 @@ def test_a_disc_that_is_turned_in_a_corner_slips_on_both_terrains(engine, mu, si
     assert_near(result.pose[2:], side * (turn - torque / 50), atol=1e-4)
 
 
-@ENGINES
-def test_a_corridor_too_low_for_the_object_is_answered_near_it_and_flagged(engine):
+def test_a_corridor_too_low_for_the_object_is_answered_near_it_and_flagged():
     """Regression: floor and ceiling closer than the box once recursed without end."""
     one = torch.ones((), dtype=torch.float64)
     scene = ContactScene(
         BOX, (floor(0 * one), HalfPlane(vector(0, -1), -0.09 * one)), vector(0.4, 0.4)
     )
     result = simulate_step(
-        scene, vector(0, 0.045, 0), vector(0, 0.02, 0), STIFFNESS, StepSettings(), engine
+        scene, vector(0, 0.045, 0), vector(0, 0.02, 0), STIFFNESS, StepSettings()
     )
     assert int(result.status) == StepStatus.RELAXED
     assert torch.isfinite(result.wrench).all()
@@ -193,9 +179,8 @@ def test_a_corridor_too_low_for_the_object_is_answered_near_it_and_flagged(engin
     assert float(world.min()) > -0.011 and float(world.max()) < 0.101
 
 
-@ENGINES
 @FRICTIONS
-def test_jammed_answers_are_finite_near_and_without_friction(engine, friction_law):
+def test_jammed_answers_are_finite_near_and_without_friction(friction_law):
     points = outline_points("mug")
     scene, start, command = random_transitions(points, 60, seed=3)
     inside = torch.stack((scene_wall(scene), scene_floor(scene), 0 * start[:, 2]), dim=-1)
@@ -210,7 +195,7 @@ def test_jammed_answers_are_finite_near_and_without_friction(engine, friction_la
     )
     scene = ContactScene(scene.points_ee, scene.terrains, torch.full_like(scene.friction, 2.0))
     result = simulate_step(
-        scene, start, command, STIFFNESS, StepSettings(friction=friction_law, substeps=1), engine
+        scene, start, command, STIFFNESS, StepSettings(friction=friction_law, substeps=1)
     )
     relaxed = result.status == StepStatus.RELAXED
     assert int(relaxed.sum()) > 10
@@ -220,7 +205,6 @@ def test_jammed_answers_are_finite_near_and_without_friction(engine, friction_la
         command,
         STIFFNESS,
         StepSettings(friction=friction_law, substeps=1),
-        engine,
     )
     torch.testing.assert_close(result.pose[relaxed], free.pose[relaxed], atol=1e-7, rtol=0)
     assert float((result.pose - start)[relaxed, :2].abs().max()) < 0.1
@@ -236,6 +220,5 @@ def test_a_wall_on_a_slope_holds_the_box_at_its_normal():
     )
     start = torch.cat((0.02 * normal, vector(0)))
     command = torch.cat((-0.02 * normal, vector(0)))
-    for engine in ("torch", "native"):
-        result = step(scene, start, command, engine)
-        torch.testing.assert_close(result.wrench[:2], 4.0 * normal, atol=1e-7, rtol=0)
+    result = step(scene, start, command)
+    torch.testing.assert_close(result.wrench[:2], 4.0 * normal, atol=1e-7, rtol=0)

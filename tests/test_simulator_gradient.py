@@ -53,7 +53,7 @@ def answer(settings, compliance, points, *given):
     scene = make_scene(
         points, friction[..., 0], height[..., 0], position[..., 0], compliance * softer
     )
-    return simulate_step(scene, start, command, stiffness, settings, engine="torch")
+    return simulate_step(scene, start, command, stiffness, settings)
 
 
 def answers(settings, compliance, *inputs):
@@ -113,27 +113,25 @@ def test_autograd_is_the_derivative_in_every_contact_mode(case, choices, complia
     )
 
 
-@pytest.mark.parametrize("engine", ["torch", "native"])
 @pytest.mark.parametrize("law", ["coulomb", "anitescu"])
 @pytest.mark.parametrize("case", list(CASES))
 @SOFT
-def test_the_response_to_the_start_is_its_derivative(case, law, engine, compliance):
+def test_the_response_to_the_start_is_its_derivative(case, law, compliance):
     points, friction, start, command, _ = CASES[case]
     scene = make_scene(points, friction, compliance=compliance * vector(1.0, 0.5))
     settings = StepSettings(friction=law, substeps=1, tolerance=1e-11)
     command, start = vector(*command), vector(*start)
-    response = simulate_step(scene, start, command, STIFFNESS, settings, engine=engine)
+    response = simulate_step(scene, start, command, STIFFNESS, settings)
     eps = 1e-7
     moves = torch.cat((torch.eye(3), -torch.eye(3))).double() * eps
-    moved = simulate_step(scene, start + moves, command, STIFFNESS, settings, engine=engine).pose
+    moved = simulate_step(scene, start + moves, command, STIFFNESS, settings).pose
     difference = (moved[:3] - moved[3:]).T / (2 * eps)
     torch.testing.assert_close(response.pose_from_start, difference, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("engine", ["torch", "native"])
 @pytest.mark.parametrize("case", list(CASES))
 @SOFT
-def test_the_response_to_a_gap_is_that_to_terrain_moving_away(case, engine, compliance):
+def test_the_response_to_a_gap_is_that_to_terrain_moving_away(case, compliance):
     points, friction, start, command, _ = CASES[case]
     settings = StepSettings(substeps=1, tolerance=1e-11)
     command, start = vector(*command), vector(*start)
@@ -148,16 +146,15 @@ def test_the_response_to_a_gap_is_that_to_terrain_moving_away(case, engine, comp
             0.3 + (eps * signs if terrain == 1 else 0 * signs),
             compliance * vector(1.0, 0.5),
         )
-        moved = simulate_step(scene, start, command, STIFFNESS, settings, engine=engine)
+        moved = simulate_step(scene, start, command, STIFFNESS, settings)
         difference = (moved.pose[0] - moved.pose[1]) / (2 * eps)
         torch.testing.assert_close(
             moved.pose_from_gap.mean(0)[terrain], difference, atol=1e-5, rtol=1e-4
         )
 
 
-@pytest.mark.parametrize("engine", ["torch", "native"])
 @pytest.mark.parametrize("case", ["stick", "slip right"])
-def test_the_response_to_a_lever_is_that_to_shifted_contact_points(case, engine):
+def test_the_response_to_a_lever_is_that_to_shifted_contact_points(case):
     """Under convex parts of the law a shift along the floor is a change of lever alone."""
     points, friction, start, command, _ = CASES[case]
     settings = StepSettings(substeps=1, tolerance=1e-11)
@@ -165,9 +162,7 @@ def test_the_response_to_a_lever_is_that_to_shifted_contact_points(case, engine)
     # Touching at the start, since in flight a shift along the floor turns into one of the gap.
     start[1] = -rotate(start[2], points)[:, 1].min()
     eps = 1e-7
-    base = simulate_step(
-        make_scene(points, friction), start, command, STIFFNESS, settings, engine=engine
-    )
+    base = simulate_step(make_scene(points, friction), start, command, STIFFNESS, settings)
     # Moving the outline along the floor shifts levers, and gaps nowhere at this angle.
     direction = torch.stack((start[2].cos(), -start[2].sin()))
     moved = [
@@ -177,7 +172,6 @@ def test_the_response_to_a_lever_is_that_to_shifted_contact_points(case, engine)
             command,
             STIFFNESS,
             settings,
-            engine=engine,
         ).pose
         for sign in (1.0, -1.0)
     ]

@@ -16,7 +16,7 @@ from contact_scenes import (
     outline_points,
     vector,
 )
-from simulator_steps import ENGINES, FRICTIONS
+from simulator_steps import FRICTIONS
 from torch import Tensor
 
 from tpcd.contact import ContactScene, terrain_gaps
@@ -26,8 +26,6 @@ from tpcd.parameters import LARGEST_FRICTION
 from tpcd.planar import transform_points, wrap_angle
 from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
 from tpcd.simulator.record import START_DEPTH
-from tpcd.simulator.rest import distance_from_rest
-from tpcd.simulator.settle import settle_from
 from tpcd.truth.scene import draw_scene
 
 DEPTH = 1e-6
@@ -44,29 +42,25 @@ def depth(scene: ContactScene, found: Transition) -> Tensor:
     return -(gaps.amin(-1) + scene.compliance * found.contacts[..., 0]).amin(-1)
 
 
-@ENGINES
 @FRICTIONS
 @pytest.mark.parametrize("friction", [1e3, 1e5, 1e6, 1e8, math.inf, -0.1])
-def test_friction_beyond_its_bounds_has_no_answer_and_names_them(engine, friction_law, friction):
+def test_friction_beyond_its_bounds_has_no_answer_and_names_them(friction_law, friction):
     scene, start, command = many_random_transitions(5, 0)
     settings = StepSettings(friction=friction_law)
-    found = simulate_step(rough(scene, friction), start, command, STIFFNESS, settings, engine)
+    found = simulate_step(rough(scene, friction), start, command, STIFFNESS, settings)
     assert (found.status == StepStatus.INVALID_INPUT).all() and found.pose.isnan().all()
     assert f"0 to {LARGEST_FRICTION:g}" in StepStatus.INVALID_INPUT.sentence
 
 
-@ENGINES
 @FRICTIONS
 @pytest.mark.parametrize("friction", [1.0, 10.0, 30.0, LARGEST_FRICTION])
-def test_what_is_converged_is_outside_of_all_terrain_however_rough_it_is(
-    engine, friction_law, friction
-):
+def test_what_is_converged_is_outside_of_all_terrain_however_rough_it_is(friction_law, friction):
     """Also where the settings say that all is gone at once: then nothing else is the answer."""
-    scene, start, command = many_random_transitions(25 if engine == "native" else 1, 0)
+    scene, start, command = many_random_transitions(25, 0)
     scene = rough(scene, friction)
     whole = StepSettings(friction=friction_law, substeps=1)
-    for settings in (replace(whole, substeps=2), whole)[engine == "torch" :]:
-        found = simulate_step(scene, start, command, STIFFNESS, settings, engine)
+    for settings in (replace(whole, substeps=2), whole):
+        found = simulate_step(scene, start, command, STIFFNESS, settings)
         converged = found.status == StepStatus.CONVERGED
         assert float(converged.double().mean()) > 0.2
         assert float(depth(scene, found)[converged].max()) <= DEPTH
@@ -133,15 +127,12 @@ def test_what_is_converged_is_at_rest_at_any_stiffness_size_angle_and_distance(s
     assert good > 0.7 * n * len(OUTLINES)
 
 
-@ENGINES
 @pytest.mark.parametrize("previous", [None, vector(0.0, 0.05, 0.0)])
-def test_a_start_inside_a_terrain_is_told_unless_a_measurement_may_be_that_wrong(engine, previous):
+def test_a_start_inside_a_terrain_is_told_unless_a_measurement_may_be_that_wrong(previous):
     inside = vector(0.9 * START_DEPTH, 1.1 * START_DEPTH, 0.03)
     start = vector(0, 0.05, 0) - inside[:, None] * vector(0, 1, 0)
     command = vector(0, 0.04, 0)
-    found = simulate_step(
-        make_scene(BOX), start, command, STIFFNESS, engine=engine, previous=previous
-    )
+    found = simulate_step(make_scene(BOX), start, command, STIFFNESS, previous=previous)
     assert found.status.tolist() == [
         StepStatus.CONVERGED,
         StepStatus.START_INSIDE,
@@ -151,45 +142,22 @@ def test_a_start_inside_a_terrain_is_told_unless_a_measurement_may_be_that_wrong
     assert "inside a terrain" in StepStatus.START_INSIDE.sentence
 
 
-@ENGINES
-def test_an_object_that_a_soft_floor_has_yielded_to_starts_on_it(engine):
+def test_an_object_that_a_soft_floor_has_yielded_to_starts_on_it():
     """Pressed with 4 N it stands 4 mm inside the undeformed floor: that is where it rests."""
     scene = make_scene(BOX, compliance=1e-3)
-    pressed = simulate_step(
-        scene, vector(0, 0.05, 0), vector(0, 0.006, 0), STIFFNESS, engine=engine
-    )
+    pressed = simulate_step(scene, vector(0, 0.05, 0), vector(0, 0.006, 0), STIFFNESS)
     assert float(pressed.pose[1]) < 0.05 - 3 * START_DEPTH
     again = simulate_step(
         scene,
         pressed.pose,
         vector(0, 0.0, 0),
         STIFFNESS,
-        engine=engine,
         previous=vector(0, 0.006, 0),
     )
     assert int(again.status) == StepStatus.CONVERGED
 
 
-def test_an_answer_that_something_else_has_moved_is_not_at_rest():
-    """The check looks at the answer alone: moved into the floor, off it, or along it, it fails."""
-    scene = make_scene(BOX).gather(torch.tensor([0]))
-    command, settings = vector([0.0, 0.01, 0.0]), StepSettings()
-    settled = settle_from(scene, vector([0.0, 0.05, 0.0]), command, STIFFNESS, settings)
-
-    def off(pose: Tensor) -> float:
-        arguments = (scene, pose, command, STIFFNESS, settled.contacts, settings)
-        return float(distance_from_rest(*arguments))
-
-    assert off(settled.pose) < 1e-7
-    for move in ((0, 1e-4, 0), (0, -1e-4, 0), (1e-4, 0, 0), (0, 0, 2e-3)):
-        assert 0.9e-4 < off(settled.pose + vector(*move)) < 2e-4
-    assert math.isinf(off(settled.pose + math.nan))
-    turn = vector(0, 0, 2 * math.pi)
-    assert off(settled.pose + turn) >= 2 * math.pi * float(BOX.norm(dim=-1).max())
-
-
-@ENGINES
-def test_an_object_that_turns_round_under_a_soft_spring_is_not_at_rest(engine):
+def test_an_object_that_turns_round_under_a_soft_spring_is_not_at_rest():
     """Pressed by kilonewtons, with springs about y that turn it for less than half a newton metre:
     what is called converged has the wrench of the angle that is told, which is within half a turn
     of the command."""
@@ -199,7 +167,7 @@ def test_an_object_that_turns_round_under_a_soft_spring_is_not_at_rest(engine):
     stiffness = vector(1e5, 1e5, 0.1)
     scene = make_scene(BOX.expand(60, *BOX.shape))
     start = vector(0, 0.1, 0).expand(60, 3)
-    found = simulate_step(scene, start, command, stiffness, engine=engine)
+    found = simulate_step(scene, start, command, stiffness)
     good = found.status <= StepStatus.START_INSIDE
     assert 5 < good.sum() < 60
     stretched = found.pose - command

@@ -16,7 +16,7 @@ from contact_scenes import (
     rotated,
     vector,
 )
-from simulator_steps import ENGINES, SIDES, step
+from simulator_steps import SIDES, step
 
 from tpcd.planar import compose
 from tpcd.simulator import ContactMode, StepSettings, StepStatus, rollout, simulate_step
@@ -24,43 +24,38 @@ from tpcd.simulator import ContactMode, StepSettings, StepStatus, rollout, simul
 # Free flight and angles
 
 
-@ENGINES
 @pytest.mark.parametrize("substeps", [1, 4])
-def test_free_flight_reaches_the_command_without_force(engine, substeps):
+def test_free_flight_reaches_the_command_without_force(substeps):
     command = vector(0.05, 0.3, 0.7)
-    result = step(make_scene(), vector(-0.1, 0.2, -0.4), command, engine, substeps=substeps)
+    result = step(make_scene(), vector(-0.1, 0.2, -0.4), command, substeps=substeps)
     torch.testing.assert_close(result.pose, command, atol=1e-15, rtol=0)
     assert result.wrench.tolist() == [0.0, 0.0, 0.0]
     assert result.mode.tolist() == [ContactMode.FREE, ContactMode.FREE]
 
 
-@ENGINES
 @SIDES
-def test_commands_across_half_a_turn_go_the_short_way_round(engine, side):
+def test_commands_across_half_a_turn_go_the_short_way_round(side):
     """At an angle near pi, upside down on the floor, the step is that of the turned box."""
     turn = side * (math.pi - 0.01)
     start, command = vector(0, 0.05, turn), vector(0.01, 0.02, turn + side * 0.03)
     command[2] = command[2] - 2 * math.pi * side
     scene = make_scene(rotated(BOX, -turn), friction=0.3)
-    result = step(scene, start, command, engine)
-    upright = step(
-        make_scene(friction=0.3), vector(0, 0.05, 0), vector(0.01, 0.02, side * 0.03), engine
-    )
+    result = step(scene, start, command)
+    upright = step(make_scene(friction=0.3), vector(0, 0.05, 0), vector(0.01, 0.02, side * 0.03))
     torch.testing.assert_close(result.wrench, upright.wrench, atol=1e-7, rtol=0)
     assert -math.pi < float(result.pose[2]) <= math.pi
     expected = compose(upright.pose * vector(0, 0, 1), vector(0, 0, turn))[2]
     assert abs(float(result.pose[2] - expected)) < 1e-9
 
 
-@ENGINES
-def test_a_rollout_is_steps_in_a_row(engine):
+def test_a_rollout_is_steps_in_a_row():
     scene, start, command = random_transitions(outline_points("mug"), 6, seed=51)
     commands = torch.stack((command, start, command))
-    transitions = rollout(scene, start, commands, STIFFNESS, StepSettings(), engine=engine)
+    transitions = rollout(scene, start, commands, STIFFNESS, StepSettings())
     pose, previous = start, None
     for command_now, transition in zip(commands, transitions, strict=True):
         alone = simulate_step(
-            scene, pose, command_now, STIFFNESS, StepSettings(), engine=engine, previous=previous
+            scene, pose, command_now, STIFFNESS, StepSettings(), previous=previous
         )
         assert torch.equal(alone.pose, transition.pose)
         pose, previous = transition.pose, command_now
@@ -103,12 +98,6 @@ def test_settings_that_mean_nothing_are_refused():
     ):
         with pytest.raises((ValueError, TypeError)):
             StepSettings(**wrong)
-
-
-def test_the_native_engine_says_what_it_cannot_do():
-    start = vector(0, 0.06, 0).requires_grad_()
-    with pytest.raises(ValueError, match="native.*no gradient"):
-        simulate_step(make_scene(), start, vector(0, 0, 0), STIFFNESS, engine="native")
 
 
 def test_every_status_is_a_sentence():

@@ -3,12 +3,9 @@ paths of many parts and slow arms."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from functools import cache
-from importlib import import_module
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,17 +17,15 @@ from tpcd.parameters import Parameters
 from tpcd.shape.builtin import make_entry
 from tpcd.shape.household import ENTRIES
 from tpcd.simulator import StepSettings, simulate_step
-from tpcd.simulator.walk import (
+from tpcd.simulator.path import (
     AIM,
     GLANCE,
     LOOK,
     SHY,
     TRY,
     ends_alike,
-    least_part,
     next_part,
     part_end,
-    parts_of_path,
     shorter_part,
 )
 from tpcd.truth.mujoco_truth import MujocoSettings, MujocoTruth
@@ -42,12 +37,6 @@ OFF = 5e-5
 """A transition that ends so far from another answer ends elsewhere [m]."""
 STEPS = 15
 MOVED = tuple(sorted(ENTRIES))[::3]
-
-
-def compiled_walk():
-    """The compiled loops' choices; an error of their own is no reason to skip."""
-    pytest.importorskip("numba")
-    return import_module("tpcd.simulator.kernel_walk")
 
 
 @pytest.mark.parametrize(
@@ -66,67 +55,24 @@ def compiled_walk():
     ],
 )
 def test_only_what_the_way_decides_is_cut(before, now, alike):
-    rows = (torch.tensor([before]), torch.tensor([now]))
-    assert ends_alike(*rows, torch.tensor([True])).tolist() == [alike]
+    codes = [sum(mode << 2 * t for t, mode in enumerate(each)) for each in (before, now)]
+    assert ends_alike(*codes, 2, True) == alike
     # Where nothing slid, only what else is touched can make a difference.
     touched_alike = [b == FREE for b in before] == [n == FREE for n in now]
-    assert ends_alike(*rows, torch.tensor([False])).tolist() == [alike or touched_alike]
-
-
-@pytest.mark.parametrize("terrains", [1, 2, 3])
-def test_compiled_loops_cut_as_torch_does(terrains):
-    kernel = compiled_walk()
-    modes = list(itertools.product(range(4), repeat=terrains))
-    settings = StepSettings(substeps=3, largest_turn=0.1)
-    request = SimpleNamespace(substeps=3, largest_turn=0.1, follow_path=False)
-    for before, now, slid in itertools.product(modes, modes, (False, True)):
-        rows = (torch.tensor([before]), torch.tensor([now]), torch.tensor([slid]))
-        codes = [sum(mode << 2 * t for t, mode in enumerate(each)) for each in (before, now)]
-        codes += [terrains, slid]
-        assert kernel.ends_alike(*codes) == bool(ends_alike(*rows))
-        for turn in (0.0, 0.3, -0.41):
-            parts = parts_of_path(settings, torch.tensor([turn], dtype=torch.float64), *rows)
-            assert kernel.parts_of_path.py_func(request, turn, *codes) == int(parts)
+    assert ends_alike(*codes, 2, False) == (alike or touched_alike)
 
 
 def test_parts_end_at_their_grid_and_at_the_command():
-    kernel = compiled_walk()
-    done, length = torch.tensor([0.0, 0.25, 0.3, 0.5, 0.99]).double(), 0.25
-    expected = [0.25, 0.5, 0.5, 0.75, 1.0]
-    found = part_end(done, torch.full_like(done, length), torch.full((5,), 4))
-    torch.testing.assert_close(found, torch.tensor(expected).double())
-    for start, end in zip(done.tolist(), expected, strict=True):
-        assert kernel.part_end(start, length, 4) == pytest.approx(end)
-
-
-@pytest.mark.parametrize("ahead", [0.0, 1e-4, 0.03, 0.2, 0.9, math.inf])
-@pytest.mark.parametrize("length", [2e-3, 0.04, 0.25])
-@pytest.mark.parametrize("finest", [1 / 32, 0.007, 0.7])  # the latter two are not exact
-def test_both_engines_take_the_same_parts(ahead, length, finest):
-    kernel = compiled_walk()
-    far, gone = (torch.tensor([v], dtype=torch.float64) for v in (ahead, length))
-    flags = [torch.tensor([False]), torch.tensor([True])]
-    for passes, seeks in itertools.product(flags, flags):
-        kind, found = next_part(passes, seeks, far, gone)
-        expected = kernel.next_part(bool(passes), bool(seeks), ahead, length)
-        assert (int(kind), float(found)) == expected
-    for name, moving in itertools.product((TRY, LOOK, AIM), flags):
-        kind = torch.tensor([name])
-        assert float(least_part(kind, finest)) == kernel.least_part(name, finest)
-        after, found = shorter_part(kind, moving, far, gone, finest)
-        expected = kernel.shorter_part(name, bool(moving), ahead, length, finest)
-        assert (int(after), float(found)) == expected
+    for start, end in ((0.0, 0.25), (0.25, 0.5), (0.3, 0.5), (0.5, 0.75), (0.99, 1.0)):
+        assert part_end(start, 0.25, 4) == pytest.approx(end)
 
 
 def test_an_expected_change_is_aimed_at_and_then_looked_at():
-    yes, no = torch.tensor([True]), torch.tensor([False])
-    ahead, left = torch.tensor([0.2]).double(), torch.tensor([0.5]).double()
-    assert next_part(no, yes, ahead, left) == (AIM, pytest.approx(SHY * 0.2))
-    assert next_part(yes, yes, ahead, left) == (LOOK, GLANCE)
-    assert next_part(no, no, ahead, left) == (TRY, 0.5)
-    assert next_part(no, yes, 3 * left, left) == (TRY, 0.5)
-    halved = shorter_part(torch.tensor([AIM]), yes, ahead, ahead, 1 / 32)
-    assert halved == (AIM, pytest.approx(0.1))
+    assert next_part(False, True, 0.2, 0.5) == (AIM, pytest.approx(SHY * 0.2))
+    assert next_part(True, True, 0.2, 0.5) == (LOOK, GLANCE)
+    assert next_part(False, False, 0.2, 0.5) == (TRY, 0.5)
+    assert next_part(False, True, 1.5, 0.5) == (TRY, 0.5)
+    assert shorter_part(AIM, True, 0.2, 0.2, 1 / 32) == (AIM, pytest.approx(0.1))
 
 
 def off_from(truth: torch.Tensor, scene: Scene, commands: torch.Tensor, settings: StepSettings):
@@ -173,63 +119,27 @@ def by_mujoco(scene: Scene, commands: torch.Tensor, settings: MujocoSettings) ->
     return torch.stack([scene.start_pose, *(truth.step(command)[0] for command in commands[1:])])
 
 
-def test_both_engines_walk_alike():
-    """Every answer, where parts are halved, in all but a few of 240 transitions: where something
-    is about to slip back and forth, rounding decides."""
-    pytest.importorskip("numba")
-    halved = unlike = elsewhere = 0
-    for scene, commands in moved_scenes():
-        truth = by_model(scene, commands)
-        asked = (model_of(scene), truth[:-1], commands[1:], scene.stiffness)
-        found, other, coarse = (
-            simulate_step(*asked, settings, engine, previous=commands[:-1])
-            for settings, engine in (
-                (StepSettings(), "native"),
-                (StepSettings(), "torch"),
-                (StepSettings(finest=1.0), "native"),
-            )
-        )
-        assert torch.equal(found.status, other.status)
-        off = (found.pose - other.pose).abs().amax(-1) > 1e-6
-        # Between two terrains, forces answer ten thousandfold to where it has settled [N/m].
-        differs = off | (found.mode != other.mode).any(-1)
-        for name in ("contacts", "pose_from_start", "pose_from_gap", "pose_from_lever"):
-            ours, theirs = (getattr(each, name).flatten(1) for each in (found, other))
-            differs |= ((ours - theirs).abs() > 1e-3 + 1e-4 * theirs.abs()).any(-1)
-        unlike, elsewhere = unlike + int(differs.sum()), elsewhere + int(off.sum())
-        halved += int(((found.pose - coarse.pose).abs().amax(-1) > 1e-6).sum())
-    assert elsewhere <= 3 and unlike <= 6
-    assert halved >= 12
-
-
-def test_in_a_corner_both_engines_end_where_the_path_leads():
+def test_in_a_corner_a_step_ends_where_the_path_leads():
     """Where nothing slides, rows that carry load may change without end: that is no change."""
-    pytest.importorskip("numba")
     prior, vectors, start, before, command = flush_corner(150)
     scene = scene_from_parameters(prior.shape, Parameters.from_vector(vectors)).double()
     asked = (scene, start.expand(150, 3), command, STIFFNESS)
     fine = StepSettings(substeps=300, finest=1.0, follow_path=True, rounds=40)
-    native, other, truth = (
-        simulate_step(*asked, settings, engine, previous=before).pose[:, :2]
-        for settings, engine in (
-            (StepSettings(), "native"),
-            (StepSettings(), "torch"),
-            (fine, "native"),
-        )
+    found, truth = (
+        simulate_step(*asked, settings, previous=before).pose[:, :2]
+        for settings in (StepSettings(), fine)
     )
-    assert ((native - other).abs().amax(-1) < 5e-5).all()
-    assert int(((native - truth).abs().amax(-1) > 5e-5).sum()) <= 2
+    assert int(((found - truth).abs().amax(-1) > 5e-5).sum()) <= 2
 
 
 def test_what_changes_here_and_now_does_not_multiply_derivatives():
     """A box stands flush at a wall, with one corner held and another about to be touched."""
-    pytest.importorskip("numba")
     generator = torch.Generator().manual_seed(1)
     noise = 1e-4 * torch.randn(2, 2000, 3, generator=generator).double()
     start = vector(0.276186, 0.0435023, 0.000933) + noise[0]
     command = vector(0.271535, 0.0506291, -0.010457) + noise[1]
     scene = make_scene(BOX, 0.9, 0.0, 0.3)
-    found = simulate_step(scene, start, command, STIFFNESS, engine="native", previous=start)
+    found = simulate_step(scene, start, command, STIFFNESS, previous=start)
     for name in ("pose_from_start", "pose_from_gap", "pose_from_lever"):
         assert float(getattr(found, name).abs().max()) < 10.0
 
@@ -251,7 +161,6 @@ def model_of(scene: Scene, floor: float = 0.0, wall: float = 0.0):
 
 def test_paths_end_where_those_of_many_parts_do():
     """Changes of contact that are located stand for a path in 300 parts."""
-    pytest.importorskip("numba")
     fine = StepSettings(substeps=300, finest=1.0, follow_path=True, rounds=40)
     usual, at_once = StepSettings(), StepSettings(finest=1.0)
     off = {usual: [], at_once: []}
@@ -279,13 +188,12 @@ EXACT = StepSettings(tolerance=1e-12)
 
 def test_derivatives_know_that_the_place_of_a_change_moves():
     """Central differences by start, floor and wall where changes of contact were located."""
-    pytest.importorskip("numba")
     size, errors = 1e-6, []
     for scene, truth, commands in moved_transitions():
 
         def step(start, settings=EXACT, scene=scene, commands=commands, **moved):
             asked = (model_of(scene, **moved), start, commands[1:], scene.stiffness)
-            return simulate_step(*asked, settings, "native", previous=commands[:-1])
+            return simulate_step(*asked, settings, previous=commands[:-1])
 
         here, start = step(truth[:-1]), truth[:-1]
         cut = step(start, replace(EXACT, finest=1.0)).pose
@@ -310,7 +218,6 @@ def test_derivatives_know_that_the_place_of_a_change_moves():
 
 def test_autograd_knows_that_the_place_of_a_change_moves():
     """Through the outline's points and friction, against central differences."""
-    pytest.importorskip("numba")
     size, errors = 1e-6, []
     for scene, truth, commands in moved_transitions()[6:10]:
         asked = (model_of(scene), truth[:-1], commands[1:], scene.stiffness)

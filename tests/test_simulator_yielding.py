@@ -1,4 +1,4 @@
-"""Terrains that yield: the contact law against independent answers, for both engines."""
+"""Terrains that yield: the contact law against independent answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from contact_scenes import BOX, STIFFNESS, make_scene, many_random_transitions, vector
 from scipy.optimize import minimize
-from simulator_steps import ENGINES, step
+from simulator_steps import step
 
 from tpcd.contact import ContactScene, terrain_gaps
 from tpcd.simulator import ContactMode, StepSettings, StepStatus, Transition, simulate_step
@@ -49,12 +49,11 @@ def laws_broken(scene: ContactScene, result: Transition) -> torch.Tensor:
     return torch.cat((balance, spring, cone, edge), dim=-1).abs().amax(-1)
 
 
-@ENGINES
-def test_where_a_step_ends_loads_springs_and_friction_obey_their_laws(engine: str) -> None:
+def test_where_a_step_ends_loads_springs_and_friction_obey_their_laws() -> None:
     """With 1 mm/N at most, 1e-7 m off a spring are 1e-4 N or, where it is stiff, more."""
     scene, start, command = many_random_transitions(100, seed=71)
     scene = softened(scene)
-    result = simulate_step(scene, start, command, STIFFNESS, ONCE, engine=engine)
+    result = simulate_step(scene, start, command, STIFFNESS, ONCE)
     settled = result.status == int(StepStatus.CONVERGED)
     assert float(settled.double().mean()) > 0.99
     both = (result.contacts[..., 0] > 0).all(-1) & settled
@@ -63,13 +62,10 @@ def test_where_a_step_ends_loads_springs_and_friction_obey_their_laws(engine: st
     assert float((broken < 0.02).double().mean()) > 0.99 and float(broken.median()) < 1e-5
 
 
-@ENGINES
-def test_without_friction_a_step_ends_where_a_general_solver_finds_the_least_energy(
-    engine: str,
-) -> None:
+def test_without_friction_a_step_ends_where_a_general_solver_finds_the_least_energy() -> None:
     scene, start, command = many_random_transitions(3, seed=72)
     scene = softened(replace(scene, friction=torch.zeros_like(scene.friction)))
-    result = simulate_step(scene, start, command, STIFFNESS, ONCE, engine=engine)
+    result = simulate_step(scene, start, command, STIFFNESS, ONCE)
     pressed = torch.nonzero((result.contacts[..., 0] > 0.1).any(-1)).flatten()
     assert len(pressed) > 15
     for k in pressed.tolist():
@@ -101,10 +97,9 @@ def _room(scene: ContactScene, variables: np.ndarray) -> np.ndarray:
     return (gaps[0] + (scene.compliance[0].sqrt() * taken)[:, None]).flatten().numpy()
 
 
-@ENGINES
 @pytest.mark.parametrize("soft", [(2e-4, 5e-4), (1e-3, 1e-5), (1e-6, 1e-4)])
 def test_floor_and_wall_share_the_load_of_what_both_hold_by_their_springs(
-    engine: str, soft: tuple[float, float]
+    soft: tuple[float, float],
 ) -> None:
     """A ladder that stands fast on the floor, sinks with it, and so slips down the wall: a linear
     system of springs. On rigid ground it would not move, and its loads would be anybody's guess."""
@@ -112,7 +107,7 @@ def test_floor_and_wall_share_the_load_of_what_both_hold_by_their_springs(
     reach, rise = 0.2 * math.cos(lean), 0.2 * math.sin(lean)
     scene = make_scene(vector([-0.2, 0.0], [0.2, 0.0]), mu, -rise, reach, vector(*soft))
     start, way = vector(0, 0, lean), vector(3e-4, -3e-4, -1e-4)
-    result = step(scene, start, start + way, engine, tolerance=1e-12)
+    result = step(scene, start, start + way, tolerance=1e-12)
     # How gaps and places along the surfaces move with the pose.
     normal = (vector(0, 1, -reach), vector(-1, 0, rise))
     along = (vector(1, 0, rise), vector(0, 1, reach))
@@ -134,65 +129,45 @@ def test_floor_and_wall_share_the_load_of_what_both_hold_by_their_springs(
     )
 
 
-@ENGINES
-def test_a_rigid_scene_is_answered_the_same_beside_one_that_yields(engine: str) -> None:
+def test_a_rigid_scene_is_answered_the_same_beside_one_that_yields() -> None:
     scene, start, command = many_random_transitions(2, seed=73)
     some = torch.arange(len(start)) % 3 == 0
     soft = softened(scene)
     mixed = replace(soft, compliance=torch.where(some[:, None], soft.compliance, 0.0))
-    whole = simulate_step(mixed, start, command, STIFFNESS, engine=engine)
+    whole = simulate_step(mixed, start, command, STIFFNESS)
     for each, those in ((scene, ~some), (soft, some)):
-        alone = simulate_step(each, start, command, STIFFNESS, engine=engine)
+        alone = simulate_step(each, start, command, STIFFNESS)
         for name, value in vars(alone).items():
             assert torch.equal(getattr(whole, name)[those], value[those])
 
 
-@ENGINES
-def test_terrain_that_hardly_yields_is_as_rigid_terrain(engine: str) -> None:
+def test_terrain_that_hardly_yields_is_as_rigid_terrain() -> None:
     scene, start, command = many_random_transitions(8, seed=74)
-    rigid = simulate_step(scene, start, command, STIFFNESS, engine=engine)
+    rigid = simulate_step(scene, start, command, STIFFNESS)
     soft = softened(scene, most=1e-8)
-    nearly = simulate_step(soft, start, command, STIFFNESS, engine=engine)
+    nearly = simulate_step(soft, start, command, STIFFNESS)
     near = (rigid.pose - nearly.pose).abs().amax(-1) < 1e-6
     # Where both hold it the rigid law leaves some ends open.
     assert float(near.double().mean()) > 0.97
 
 
-@ENGINES
 @pytest.mark.parametrize("wrong", [-1e-4, float("nan"), float("inf")])
-def test_a_compliance_that_means_nothing_is_flagged_and_disturbs_no_other(
-    engine: str, wrong: float
-) -> None:
+def test_a_compliance_that_means_nothing_is_flagged_and_disturbs_no_other(wrong: float) -> None:
     scene, start, command = many_random_transitions(1, seed=75)
     soft = softened(scene)
-    fine = simulate_step(soft, start, command, STIFFNESS, engine=engine)
+    fine = simulate_step(soft, start, command, STIFFNESS)
     compliance = soft.compliance.clone()
     compliance[4, 1] = wrong
     bad = replace(soft, compliance=compliance)
-    found = simulate_step(bad, start, command, STIFFNESS, engine=engine)
+    found = simulate_step(bad, start, command, STIFFNESS)
     assert int(found.status[4]) == StepStatus.INVALID_INPUT and found.pose[4].isnan().all()
     others = torch.arange(len(start)) != 4
     assert torch.equal(found.pose[others], fine.pose[others])
 
 
-def test_both_engines_end_alike_on_terrain_that_yields() -> None:
-    scene, start, first = many_random_transitions(60, seed=76)
-    scene, second = softened(scene), first + vector(0.004, -0.003, 0.01)
-    rest = simulate_step(scene, start, first, STIFFNESS, engine="native")
-    found, other = (
-        simulate_step(scene, rest.pose, second, STIFFNESS, engine=e, previous=first)
-        for e in ("native", "torch")
-    )
-    near = (found.pose - other.pose).abs().amax(-1) < 1e-6
-    assert float(near.double().mean()) > 0.99
-    for name in ("pose_from_start", "pose_from_gap", "pose_from_lever", "contacts"):
-        off = (getattr(found, name) - getattr(other, name)).abs().flatten(1).amax(-1)
-        assert float((off < 1e-3)[near].double().mean()) > 0.98
-
-
 def test_what_jams_on_rigid_terrain_is_answered_beside_terrain_that_yields() -> None:
     """A box between a floor and two walls that are closer than it is wide: on rigid walls it jams
-    even without friction, which the compiled loops leave to torch."""
+    even without friction, and is put between them."""
     two, zero = torch.zeros(2, dtype=torch.float64), vector(0.0, 0.0)
     walls = (wall(two + 0.02), HalfPlane(vector(1, 0).expand(2, 2), two - 0.02))
     compliance = torch.zeros(2, 3, dtype=torch.float64)
@@ -201,10 +176,7 @@ def test_what_jams_on_rigid_terrain_is_answered_beside_terrain_that_yields() -> 
         BOX.expand(2, -1, 2), (floor(zero), *walls), torch.full((2, 3), 0.5).double(), compliance
     )
     start, command = vector(0, 0.05, 0).expand(2, 3), vector(0, 0.04, 0).expand(2, 3)
-    found, other = (
-        simulate_step(scene, start, command, STIFFNESS, ONCE, engine=e) for e in ("native", "torch")
-    )
-    assert found.status.tolist() == other.status.tolist()
+    found = simulate_step(scene, start, command, STIFFNESS, ONCE)
     # It starts 10 mm inside both walls.
     assert found.status.tolist() == [StepStatus.RELAXED, StepStatus.START_INSIDE]
-    torch.testing.assert_close(found.pose, other.pose)
+    torch.testing.assert_close(found.pose[0], vector(0, 0.05, 0), atol=1e-4, rtol=0)

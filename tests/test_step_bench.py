@@ -17,7 +17,7 @@ def test_the_quick_run_times_every_part_and_draws_the_curve(tmp_path, capsys):
     results = read_json(folder / "results.json")
     rows = results["table"]
     parts = [row["part"] for row in rows]
-    for name in ("shape", "weights", "filter step", "QP native, 16 rows, one solve"):
+    for name in ("shape", "weights", "filter step", "QP, 16 rows, one solve"):
         assert name in parts and name in printed
     assert all(0 < row["wall_s"] < 60 and row["cpu_s"] > 0 for row in rows)
     (whole, *_), pieces = [r for r in rows if r["part"] == "filter step"], rows[:3]

@@ -6,7 +6,6 @@ the first command that needs them waits for that, in the middle of its work.
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from dataclasses import dataclass
 
@@ -49,9 +48,6 @@ class CompileAhead:
 
 def compile_ahead(config: CompileAhead) -> None:
     """Compile what is not compiled yet, and say how long that took."""
-    if importlib.util.find_spec("numba") is None:
-        print("numba is not installed (extra `fast`): there is nothing to compile")
-        return
     began = time.perf_counter()
     compile_loops()
     print(f"the compiled loops are ready ({time.perf_counter() - began:.0f} s)")

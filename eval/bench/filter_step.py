@@ -20,7 +20,6 @@ from tpcd.planar import wrap_angle
 from tpcd.qp import ContactQP, solve
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings, StepStatus, Transition, simulate_step
-from tpcd.simulator.step import Engine
 from tpcd.terrain import floor, wall
 
 STIFFNESS = (100.0, 100.0, 50.0)
@@ -80,16 +79,15 @@ def filter_step_parts(
     shape = _on(shape, device)
     work = make_work(shape, particles, memory, seed, device)
     scene = column_scene(decoded_scene(shape, work.parameters))
-    transition = _simulate(scene, work, PAPER_STEP, "auto")
+    transition = _simulate(scene, work, PAPER_STEP)
 
     def whole() -> Tensor:
         fresh = column_scene(decoded_scene(shape, work.parameters))
-        return weights(work, _simulate(fresh, work, PAPER_STEP, "auto"))
+        return weights(work, _simulate(fresh, work, PAPER_STEP))
 
-    engine = "torch" if device.type == "cuda" else "native, with the QP"
     parts = {
         "shape": lambda: decoded_scene(shape, work.parameters),
-        f"contact ({engine})": lambda: _simulate(scene, work, PAPER_STEP, "auto"),
+        "contact, with the QP": lambda: _simulate(scene, work, PAPER_STEP),
         "weights": lambda: weights(work, transition),
         "filter step": whole,
     }
@@ -99,27 +97,25 @@ def filter_step_parts(
 def model_rows(
     shape: Shape, particles: int, memory: int, seed: int, device: torch.device, timed: Timer
 ) -> list[dict[str, Any]]:
-    """Rows for f_theta by engine, friction and substeps, and for the QP alone."""
+    """Rows for f_theta by friction and substeps, with gradients too, and for the QP alone."""
     shape = _on(shape, device)
     work = make_work(shape, particles, memory, seed, device)
     scene = column_scene(decoded_scene(shape, work.parameters))
     rows = []
-    for engine in ("torch",) if device.type == "cuda" else ("native", "torch"):
-        for friction in ("anitescu", "coulomb"):
-            for substeps in (1, 10):
-                settings = StepSettings(
-                    friction=friction, substeps=substeps, finest=1.0, follow_path=True
-                )
-                if engine == "torch" and device.type == "cpu" and substeps > 1:
-                    continue
-                found = _simulate(scene, work, settings, engine)
-                times = timed(lambda s=settings, e=engine: _simulate(scene, work, s, e))
-                name = f"f_theta {engine} {friction} {substeps} substeps"
-                rows.append(_row(name, work, times, found))
+    for friction in ("anitescu", "coulomb"):
+        for substeps in (1, 10):
+            settings = StepSettings(
+                friction=friction, substeps=substeps, finest=1.0, follow_path=True
+            )
+            found = _simulate(scene, work, settings)
+            times = timed(lambda s=settings: _simulate(scene, work, s))
+            rows.append(_row(f"f_theta {friction} {substeps} substeps", work, times, found))
+            times = timed(lambda s=settings: _gradient(scene, work, s))
+            name = f"f_theta and gradient, {friction} {substeps} substeps"
+            rows.append(_row(name, work, times, found))
     problem = contact_problem(work, device)
-    for engine in ("exact",) if device.type == "cuda" else ("native", "exact"):
-        times = timed(lambda e=engine: solve(problem, engine=e))
-        rows.append(_row(f"QP {engine}, {QP_ROWS} rows, one solve", work, times, None))
+    times = timed(lambda: solve(problem))
+    rows.append(_row(f"QP, {QP_ROWS} rows, one solve", work, times, None))
     return rows
 
 
@@ -182,10 +178,15 @@ def contact_problem(work: Work, device: torch.device) -> ContactQP:
     return replace(problem, **moved)
 
 
-def _simulate(
-    scene: ContactScene, work: Work, settings: StepSettings, engine: Engine
-) -> Transition:
-    return simulate_step(scene, work.start, work.command, work.stiffness, settings, engine=engine)
+def _simulate(scene: ContactScene, work: Work, settings: StepSettings) -> Transition:
+    return simulate_step(scene, work.start, work.command, work.stiffness, settings)
+
+
+def _gradient(scene: ContactScene, work: Work, settings: StepSettings) -> Tensor:
+    """Of the sum of all poses, by the outlines."""
+    points = scene.points_ee.detach().requires_grad_()
+    found = _simulate(replace(scene, points_ee=points), work, settings)
+    return torch.autograd.grad(found.pose.nan_to_num(0.0).sum(), points)[0]
 
 
 def _on(shape: Shape, device: torch.device) -> Shape:

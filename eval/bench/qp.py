@@ -1,7 +1,6 @@
-"""Time and check the contact QP engines against each other and against other solvers.
+"""Time and check the contact QP solver against others.
 
 python -m eval.bench.qp --out runs/bench_qp
-python -m eval.bench.qp --device cuda --out runs/bench_qp_cuda
 
 Problems are made like those of the simulator (contact_problems.py): mixed numbers of
 contacts, so that most are padded, with duplicates and flat faces. All solvers run on the
@@ -53,8 +52,6 @@ class Benchmark:
     """Sizes: rows of a problem, two for each contact."""
     threads: int = 1
     """Threads of torch."""
-    device: str = "cpu"
-    """Where the exact engine runs (cpu or cuda); the others run on the CPU only."""
     wrong_above: float = 1e-6
     """A claimed solution whose force is off by more than this counts as wrong [N]."""
     seed: int = 0
@@ -75,12 +72,9 @@ def benchmark(config: Benchmark) -> None:
     """Print seconds, force errors and failures of every contact QP solver that is installed."""
     import torch
 
-    from tpcd.errors import SolverError
     from tpcd.results import run_folder
 
     torch.set_num_threads(config.threads)
-    if torch.device(config.device).type == "cuda" and not torch.cuda.is_available():
-        raise SolverError(f"device is {config.device}, but no CUDA device is here; use cpu")
     with run_folder(config.out, "python -m eval.bench.qp", config, config.overwrite) as folder:
         compare_solvers(config, folder)
     print(f"\nwritten to {config.out}")
@@ -88,7 +82,6 @@ def benchmark(config: Benchmark) -> None:
 
 def compare_solvers(config: Benchmark, folder: Path) -> None:
     """The benchmark in an opened run folder."""
-    import torch
     from torch.utils.tensorboard import SummaryWriter
 
     from eval.bench.contact_problems import random_contact_problems
@@ -104,7 +97,7 @@ def compare_solvers(config: Benchmark, folder: Path) -> None:
         problem = random_contact_problems(count, rows, config.seed)
         forces, source = reference_forces(problem)
         sources.add(source)
-        for solver in available_solvers(config.device):
+        for solver in available_solvers():
             _show_progress(f"{rows} rows: {solver.name}")
             table.append({"rows": rows, **measure(solver, problem, forces, config)})
     if len(config.rows) > 1:
@@ -112,10 +105,9 @@ def compare_solvers(config: Benchmark, folder: Path) -> None:
     _add_ratios(table)
     _show_progress("")
     print(format_table(table, formats=FORMATS))
-    clock = "CPU" if torch.device(config.device).type == "cpu" else "wall-clock"
     note = (
-        f"{count} problems of each size. seconds: {clock} seconds for all of them (scaled up "
-        f"where fewer were solved); times_qpth: how many times faster than the engine "
+        f"{count} problems of each size. seconds: CPU seconds for all of them (scaled up "
+        f"where fewer were solved); times_qpth: how many times faster than "
         f"qpth ('qpth plain' is one call of the package, which gives up early); error_n: "
         f"largest force error of what is claimed to be solved [N], against "
         f"{', '.join(sorted(sources))}; wrong: claimed solutions off by more than "
@@ -124,7 +116,7 @@ def compare_solvers(config: Benchmark, folder: Path) -> None:
     print("\n" + note)
     write_results(folder, table, seeds=[config.seed], note=note)
     with SummaryWriter(folder / "tensorboard") as writer:
-        figure = solver_seconds(table, count, clock)
+        figure = solver_seconds(table, count, "CPU")
         save_figure(figure, folder / "figures", "solver_seconds", writer)
         for line in table:
             for quantity, group in TAGS.items():
@@ -144,19 +136,16 @@ def measure(
 ) -> dict[str, Any]:
     """One line of the table: how long a solver takes and how right it is."""
     import numpy as np
-    import torch
 
     count = len(forces)
     used = max(1, round(solver.share * count))
-    given = _moved(problem, slice(0, used), config.device)
-    solver.run(_moved(problem, slice(0, 2), config.device))  # imports and compilation
-    on_cpu = torch.device(config.device).type == "cpu"
-    clock = time.process_time if on_cpu else time.perf_counter
+    given = _part(problem, slice(0, used))
+    solver.run(_part(problem, slice(0, 2)))  # imports and compilation
     seconds, answer = float("inf"), None
     for _ in range(solver.repeats):
-        start = clock()
+        start = time.process_time()
         answer = solver.run(given)
-        seconds = min(seconds, clock() - start)
+        seconds = min(seconds, time.process_time() - start)
     assert answer is not None
     motions, solved = answer
     hessian = problem.hessian.expand(count, *problem.hessian.shape[-2:])[:used].numpy()
@@ -205,17 +194,17 @@ def _add_ratios(table: list[dict[str, Any]]) -> None:
             line["times_qpth"] = base[line["rows"]] / line["seconds"]
 
 
-def _moved(problem: ContactQP, part: slice, device: str) -> ContactQP:
-    """Some of the problems, on a device."""
+def _part(problem: ContactQP, part: slice) -> ContactQP:
+    """Some of the problems."""
     from tpcd.qp import ContactQP
 
     mask = problem.row_mask
     return ContactQP(
-        hessian=problem.hessian.to(device),
-        target=problem.target[part].to(device),
-        rows=problem.rows[part].to(device),
-        offsets=problem.offsets[part].to(device),
-        row_mask=None if mask is None else mask[part].to(device),
+        hessian=problem.hessian,
+        target=problem.target[part],
+        rows=problem.rows[part],
+        offsets=problem.offsets[part],
+        row_mask=None if mask is None else mask[part],
     )
 
 

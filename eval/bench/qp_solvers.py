@@ -14,7 +14,7 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from tpcd.qp import ContactQP, native_available, solve
+from tpcd.qp import ContactQP, solve
 
 FAR = 10.0
 """Offset of the unit rows that pad problems for plain qpth [m]; of 0.003 to 1000 m the one
@@ -38,14 +38,11 @@ class Solver:
     """Share of the problems it gets, where all would take too long; its time is scaled up."""
 
 
-def available_solvers(device: str) -> list[Solver]:
-    """What can run here, fastest last; on an accelerator only the exact engine can."""
-    exact = Solver("exact", _engine("exact"), repeats=5)
-    if torch.device(device).type != "cpu":
-        return [exact]
+def available_solvers() -> list[Solver]:
+    """What can run here, fastest last."""
     solvers = []
     if find_spec("qpth"):
-        solvers.append(Solver("qpth", _engine("qpth")))
+        solvers.append(Solver("qpth", _backend("qpth")))
         solvers.append(Solver("qpth plain", solve_by_qpth))
     if find_spec("osqp"):
         solvers.append(Solver("osqp", solve_by_osqp))
@@ -57,22 +54,20 @@ def available_solvers(device: str) -> list[Solver]:
         for name in sorted(set(qpsolvers.dense_solvers + qpsolvers.sparse_solvers)):
             if name not in ("osqp", "daqp"):
                 solvers.append(Solver(name, _through_qpsolvers(name), share=0.02))
-    solvers.append(exact)
-    if native_available():
-        solvers.append(Solver("native", _engine("native"), repeats=20))
+    solvers.append(Solver("native", _backend("native"), repeats=20))
     return solvers
 
 
 def reference_forces(problem: ContactQP) -> tuple[np.ndarray, str]:
     """Exact generalised forces (b, n), NaN where infeasible, and where they come from.
 
-    DAQP on whitened problems at a tight tolerance; where it is not installed, the exact
-    engine, whose residual then stands in the table's place of an independent check.
+    DAQP on whitened problems at a tight tolerance; where it is not installed, the native
+    backend, whose residual then stands in the table's place of an independent check.
     """
     if find_spec("daqp") is None:
-        answer = solve(problem, "exact", elastic=False)
+        answer = solve(problem, elastic=False)
         step = (answer.motion - problem.target)[..., None]
-        return (problem.hessian @ step)[..., 0].numpy(), "exact engine (DAQP is not installed)"
+        return (problem.hessian @ step)[..., 0].numpy(), "native (DAQP is not installed)"
     import daqp
 
     forces = np.full(problem.target.shape, np.nan)
@@ -175,7 +170,7 @@ def solve_by_daqp(problem: ContactQP) -> Answer:
     return motions, solved
 
 
-def _engine(name: str) -> Callable[[ContactQP], Answer]:
+def _backend(name: str) -> Callable[[ContactQP], Answer]:
     def run(problem: ContactQP) -> Answer:
         answer = solve(problem, name, elastic=False)
         return answer.motion.cpu().numpy(), answer.solved.cpu().numpy()

@@ -4,10 +4,8 @@ python -m eval.bench.step --out runs/bench_step
 python -m eval.bench.step --device cuda --out runs/bench_step_cuda
 
 A filter step decodes M latents, simulates the N transitions in memory for each particle and
-weighs them. The compiled engine solves contact and QP as one loop; the torch engine, which
-also runs on a GPU and carries gradients, is timed as a whole too, and its QP alone. On the
-CPU the seconds are CPU seconds of all threads, so that a busy machine matters less;
-`wall_s` is what a clock showed.
+weighs them. f_theta is timed with and without gradients, and its QP alone. On the CPU these are CPU
+seconds of all threads, so that a busy machine matters less; `wall_s` is what a clock showed.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ class Benchmark:
     threads: int = 2
     """Threads of torch and of the compiled loops."""
     device: str = "cpu"
-    """Where shape and torch engine run (cpu or cuda); the compiled engine needs the CPU."""
+    """Where the shape decodes (cpu or cuda); contact is solved on the CPU."""
     seed: int = 0
     """Seed of particles and commands."""
     quick: bool = False

@@ -39,7 +39,7 @@ from tpcd.data.episode import Episode
 from tpcd.parameters import Parameters
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
-from tpcd.simulator.native import torch_in_one_thread
+from tpcd.threads import torch_in_one_thread
 
 _SOME_FREE = 1e-3
 """Where no draw is free at the start with this probability, they are not weighted by it."""

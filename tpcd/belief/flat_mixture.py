@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tpcd.belief.proposals import DEGREES_OF_FREEDOM, summed
 from tpcd.belief.resampling import systematic_resample
-from tpcd.simulator import native
 
 WIDTHS = (0.3, 0.6, 1.0, 1.5)
 """Of components, relative to the deviations of the points."""
@@ -69,25 +68,13 @@ class FlatMixture:
         peak = peak - float(self.factor.diagonal().log().sum()) - math.log(len(self.centres))
         away = (flat[:, self.order] - self.mean).mT
         unit = torch.linalg.solve_triangular(self.factor, away, upper=False).mT
-        if native.available() and flat.device.type == "cpu":
-            total = self._compiled(unit)
-        else:
-            total = torch.cat([self._sums(part) for part in unit.split(_POINTS_AT_ONCE)])
+        total = self._sums(unit)
         width = self.mean.new_tensor(WIDTHS)
         b = self.centres.shape[-1]
         return total.log() - b * width.log() + peak + self.shares.log()
 
     def _sums(self, unit: Tensor) -> Tensor:
         """Sums (m, w) over the centres of densities without their peaks."""
-        d, nu, b = len(self.mean), DEGREES_OF_FREEDOM, self.centres.shape[-1]
-        narrow, rest = unit[:, :b], unit[:, b:].square().sum(-1, keepdim=True)
-        found = []
-        for width in unit.new_tensor(WIDTHS):
-            square = torch.cdist(narrow, _kept(width) * self.centres).square() / width**2
-            found.append(((1 + (square + rest) / nu) ** (-(nu + d) / 2)).sum(-1))
-        return torch.stack(found, -1)
-
-    def _compiled(self, unit: Tensor) -> Tensor:
         from tpcd.belief.mixture_kernel import FlatComponents, flat_sum_range
 
         width = unit.new_tensor(WIDTHS)

@@ -43,7 +43,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.weights import finite
 from tpcd.planar import rotate
-from tpcd.simulator import native
+from tpcd.threads import over_threads
 
 INSIDE = 0.02
 """How far inside the box the likeliest six are, as a share of its widths: at the edge, scores are
@@ -160,7 +160,7 @@ class Flattening:
         """Mean (m, 6) of the six given the rest, the Cholesky factor of their precision, and the
         log likelihood of the rest."""
         at_once = max(1, _TOUCHES_AT_ONCE // max(1, len(self.poses)))
-        parts = native.over_threads(self._conditional_part, score, at_once)
+        parts = over_threads(self._conditional_part, score, at_once)
         mean, factor, marginal = (torch.cat(column) for column in zip(*parts, strict=True))
         return mean, factor, marginal
 

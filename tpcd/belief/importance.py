@@ -33,7 +33,7 @@ from tpcd.belief.weights import (
     spread_choice,
     threshold,
 )
-from tpcd.simulator.native import torch_in_one_thread
+from tpcd.threads import torch_in_one_thread
 
 _LEAST_SHARE = 0.02
 """Share of the draws that each damping keeps at least."""

@@ -1,8 +1,7 @@
 """The history likelihood in compiled loops, one particle after the other.
 
-The same formulas as `kalman` and `likelihood`, with the steps of `tpcd.simulator.kernel`: a
-particle steps a transition, filters its residual, and is given up as soon as it cannot reach
-its threshold any more. Nothing is allocated for each particle. Imported only where numba is.
+A particle steps a transition, filters its residual as `filter` says, and is given up as soon as it
+cannot reach its threshold any more. Nothing is allocated for each particle.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ from collections.abc import Callable
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-from tpcd.belief import kalman, kernel_filter, kernel_given, kernel_state
-from tpcd.belief.kalman import PASSES
-from tpcd.belief.kernel_filter import assimilate, follow
+from tpcd.belief import filter, kernel_filter, kernel_given, kernel_state
+from tpcd.belief.filter import PASSES
+from tpcd.belief.kernel_filter import assimilate, by_scene, follow
 from tpcd.belief.kernel_state import (
     begin,
     copy_state,
@@ -26,11 +24,11 @@ from tpcd.belief.kernel_state import (
     new_filter,
     pass_over,
 )
-from tpcd.simulator.kernel import source_stamp
-from tpcd.simulator.kernel_element import step_element
-from tpcd.simulator.kernel_geometry import World, new_chains
-from tpcd.simulator.kernel_inner import inner
-from tpcd.simulator.kernel_request import (
+from tpcd.loops import inner, njit
+from tpcd.simulator.batch import source_stamp
+from tpcd.simulator.element import step_element
+from tpcd.simulator.geometry import World, new_chains
+from tpcd.simulator.request import (
     Answer,
     Request,
     new_planes,
@@ -38,9 +36,8 @@ from tpcd.simulator.kernel_request import (
     prepare,
     set_stiffness,
 )
-from tpcd.simulator.kernel_settle import JAMMED
-from tpcd.simulator.kernel_slopes import new_slopes
-from tpcd.simulator.kernel_space import new_space
+from tpcd.simulator.tangents import BY_SCENE, NOTHING_MORE, new_slopes
+from tpcd.simulator.workspace import new_space
 
 
 def _compile_explain_range(stamp: int) -> Callable[..., None]:
@@ -64,7 +61,8 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
     steps, size = measured.used.shape[0], found.mean.shape[1]
     entries = by_theta.offsets.shape[1]
     chains, space = new_chains(terrains, count), new_space(terrains, law.room)
-    slopes = new_slopes(terrains, entries, law.room)
+    slopes = new_slopes(terrains, count, BY_SCENE if entries else NOTHING_MORE, law.room)
+    theta = np.zeros((entries, 3))
     poses = np.zeros((7, 3))
     answer = Answer(
         np.zeros((steps, 3)),
@@ -75,6 +73,8 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
         np.zeros((steps, terrains, 3)),
         np.zeros((steps, terrains, 3)),
         np.zeros((steps, terrains, 4)),
+        np.zeros((steps, 0, 3)),
+        np.zeros((steps, 0, 2, 3)),
     )
     state = new_filter(size, entries, terrains)
     # Each particle starts its transitions at poses of its own.
@@ -142,15 +142,10 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
                 _meet(here, given, i, k + 1)
                 for t in range(terrains):
                     here.offsets[0, t] -= state.gap[t]
-                step_element(
-                    here, 0, chains, law, extent, request, k,
-                    answer, space, slopes, poses, by_theta, i,
-                )  # fmt: skip
+                step_element(here, 0, chains, law, extent, request, k, answer, space, slopes, poses)
                 answer.poses[k, 2] -= ends
                 for a in range(3):
                     answer.poses[k, a] += measured.give[seen, k + 1, a]
-                if answer.statuses[k] == JAMMED:
-                    break
                 term = assimilate(state, measured, answer, seen, k, measured.sd[i])
                 if again == 0 and math.isfinite(term):
                     explained, first_term = is_explained(state, measured), term
@@ -167,9 +162,6 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
                 else:
                     break
                 copy_state(state.mean_before, state.covariance_before, state.mean, state.covariance)
-            if answer.statuses[k] == JAMMED:
-                found.jammed[i] = True
-                break
             if found.poses.shape[0] > 0:
                 _keep(found, answer, i, k)
             total += term
@@ -177,12 +169,11 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
                 for a in range(3):
                     found.whitened[i, k, a] = state.innovation[a]
                     found.log_scale[i, k, a] = math.log(state.factor[a, a])
-                follow(state, slopes.theta, found.slopes, i, k, size)
+                by_scene(slopes, by_theta, i, theta)
+                follow(state, theta, found.slopes, i, k, size)
             if not (total + measured.rest[seen, k] >= measured.least[i] and math.isfinite(total)):
                 total = -np.inf
                 break
-        if found.jammed[i]:
-            continue
         found.total[i] = total
         for a in range(size):
             found.mean[i, a] = state.mean[a]
@@ -268,7 +259,7 @@ def _keep(found, answer, i, k):
 
 
 explain_range = _compile_explain_range(
-    source_stamp(sys.modules[__name__], kalman, kernel_filter, kernel_given, kernel_state)
+    source_stamp(sys.modules[__name__], filter, kernel_filter, kernel_given, kernel_state)
 )
 """Evaluate the particles `which[first:last]`: (points, law, given, measured, by_theta, found,
 which, first, last).

@@ -1,7 +1,7 @@
 """The filter of one particle in compiled loops: coefficients of the misfit field and the error
 of the last reading, a transition at a time.
 
-The same formulas as `kalman`. Loops run along rows of matrices, so that the compiler can do
+The formulas of `filter`. Loops run along rows of matrices, so that the compiler can do
 several columns at once; columns of terrains that are not touched are zero and passed over.
 """
 
@@ -12,8 +12,8 @@ from typing import no_type_check
 
 import numpy as np
 
-from tpcd.simulator.kernel_inner import inner
-from tpcd.simulator.kernel_settle import RELAXED
+from tpcd.loops import inner
+from tpcd.simulator.rest import RELAXED
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -203,3 +203,22 @@ def _forward(factor, vector):
         for k in range(i):
             value -= factor[i, k] * vector[k]
         vector[i] = value / factor[i, i]
+
+
+@inner
+@no_type_check
+def by_scene(slopes, by_theta, i, found):
+    """Derivatives (d, 3) of a settled pose by the d entries of theta of particle i, whose scene
+    moves with them: those by friction, gaps and touched points are strung together."""
+    terrains = slopes.land_gap.shape[0]
+    for e in range(found.shape[0]):
+        for a in range(3):
+            value = 0.0
+            for t in range(terrains):
+                value -= slopes.whole[3 + t, a] * by_theta.offsets[i, e, t]
+                value += slopes.further[t, a] * by_theta.friction[i, e, t]
+            for s in range(slopes.count[0]):
+                p, r = slopes.touched[s, 0], slopes.inputs + 2 * s
+                value += slopes.further[r, a] * by_theta.points[i, e, 0, p]
+                value += slopes.further[r + 1, a] * by_theta.points[i, e, 1, p]
+            found[e, a] = value

@@ -55,6 +55,16 @@ class Given(NamedTuple):
     follow_path: bool
 
 
+class SceneSlopes(NamedTuple):
+    """How the scenes of the batch move with d entries of theta: points (.., d, 2, p) in the
+    end-effector frame, offsets and friction (.., d, t) of the terrains. d = 0 asks nothing.
+    """
+
+    points: np.ndarray
+    offsets: np.ndarray
+    friction: np.ndarray
+
+
 class Found(NamedTuple):
     """Where the answers go: log likelihood (m), field mean (m, c) and covariance (m, c, c),
     innovations and the logarithms of their units (m, n, 3) where they are asked for (else m = 0),
@@ -65,7 +75,6 @@ class Found(NamedTuple):
     total: np.ndarray
     mean: np.ndarray
     covariance: np.ndarray
-    jammed: np.ndarray
     whitened: np.ndarray
     log_scale: np.ndarray
     slopes: np.ndarray

@@ -1,7 +1,7 @@
 """The state of one particle's filter in compiled loops: what is known of the misfit field and of
 the last reading's error, before and after a transition.
 
-The same formulas as `kalman`; `kernel_filter` brings in what a transition tells.
+The formulas of `filter`; `kernel_filter` brings in what a transition tells.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from tpcd.simulator.kernel_inner import inner
+from tpcd.loops import inner
 
 
 class Filter(NamedTuple):

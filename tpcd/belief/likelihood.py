@@ -1,7 +1,7 @@
 """Likelihood of a history given theta: every datum once, noise propagated, misfit integrated.
 
 Each particle steps every transition from its filtered start pose and filters the residual as
-`kalman` says, which integrates the misfit field and the reading errors out. A particle whose
+`filter` says, which integrates the misfit field and the reading errors out. A particle whose
 step fails or is not finite gets log likelihood -inf; one that has not quite converged counts.
 
 A sampler that has drawn its random number already knows what log likelihood a proposal must
@@ -27,8 +27,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.belief.compiled import compiled_filter
-from tpcd.belief.filtered import HistoryLikelihood, Steps, filter_history, joined
+from tpcd.belief.filter import HistoryLikelihood, Steps, filter_history, joined
 from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History
 from tpcd.belief.misfit import MisfitField
@@ -38,9 +37,9 @@ from tpcd.effects.conditions import Outcome
 from tpcd.effects.protocol import Added, Effect, parts_of
 from tpcd.effects.simulate import outcome_in_parts
 from tpcd.parameters import Parameters
+from tpcd.shape.decoding import outlines
 from tpcd.shape.protocol import Shape
-from tpcd.simulator import StepSettings, native
-from tpcd.simulator.step import needs_gradient
+from tpcd.simulator import StepSettings
 
 AT_ONCE = 64
 """Particles of an uneven floor that are evaluated together: each row of each has an outline of its
@@ -96,9 +95,7 @@ def history_likelihood(
             options = (settings, bounds, innovations, effects, answered, steps)
             found.append(history_likelihood(shape, *some, *options))
         return joined(found)
-    compiled = misfit_sd.device.type == "cpu" and native.available() and not needs_gradient(*inputs)
-    points = native.outlines(shape, parameters) if compiled else None
-    scene = scene_from_parameters(shape, parameters, points)
+    scene = scene_from_parameters(shape, parameters, outlines(shape, parameters))
     setting = history.setting(scene)
     further = torch.zeros_like(misfit_sd)
     if added is not None and added.effects:
@@ -113,10 +110,7 @@ def history_likelihood(
             highest = starts.log_free_before(field, misfit_sd) + setting.highest_terms.sum(-1)
             least = torch.where(highest > least, least, torch.inf)
     arguments = (scene.points_ee, setting, misfit_sd, field, settings)
-    if compiled:
-        found = compiled_filter(*arguments, least, innovations, steps)
-    else:
-        found = filter_history(*arguments, innovations, steps)
+    found = filter_history(*arguments, least, innovations, steps)
     if starts is not None:
         further = further + starts.log_free(
             field, misfit_sd, found.field_mean, found.field_covariance
@@ -144,10 +138,7 @@ def effective_setting(
         # What a row is loaded with counts for the next one, also where its transition does not.
         setting = replace(_answering(base, history, added, outcome), used=~history.seams)
         arguments = (scene.points_ee, setting, misfit_sd, field, settings)
-        if misfit_sd.device.type == "cpu" and native.available():
-            found = compiled_filter(*arguments, steps=True)
-        else:
-            found = filter_history(*arguments, steps=True)
+        found = filter_history(*arguments, steps=True)
         assert found.steps is not None
         now = outcome_of(found.steps, history, setting.used, scene.points_ee, first=k == 0)
         outcome = now.after(outcome)

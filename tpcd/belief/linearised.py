@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.compiled import compiled_filter
-from tpcd.belief.filtered import HistoryLikelihood
+from tpcd.belief.filter import HistoryLikelihood, filter_history
 from tpcd.belief.history import History
 from tpcd.belief.likelihood import effective_setting
 from tpcd.belief.misfit import MisfitField
@@ -19,8 +18,9 @@ from tpcd.contact import place_points, scene_from_parameters
 from tpcd.effects.conditions import Outcome
 from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
+from tpcd.shape.decoding import decode
 from tpcd.shape.protocol import Shape
-from tpcd.simulator import StepSettings, native
+from tpcd.simulator import StepSettings
 
 _DIFFERENCE = 1e-3
 """Difference of a coordinate by which a scene moves for its derivatives."""
@@ -50,28 +50,27 @@ def linearised_likelihood(
 
     `vectors` are theta, and `slopes` the derivatives of each entry by its own coordinate. The
     scene moves by differences, the settled poses by the derivatives of the rest equations,
-    and the filter at a fixed gain (Gauss-Newton). NaN where a particle jams. Effects are taken
+    and the filter at a fixed gain (Gauss-Newton). Effects are taken
     as they are, as if theta did not change how they act.
     """
-    from tpcd.simulator.kernel_slopes import SceneSlopes
+    from tpcd.belief.kernel_given import SceneSlopes
 
     m, d = vectors.shape
     z = shape.latent_dim
     steps = torch.diag(torch.full((d,), _DIFFERENCE, dtype=vectors.dtype))
     moved = torch.cat((vectors[None], vectors + steps[:, None] * slopes))
     decoded = Parameters.from_vector(moved[: z + 1].flatten(0, 1)).latent
-    points = native.decode(shape, decoded).unflatten(0, (z + 1, m))
+    points = decode(shape, decoded).unflatten(0, (z + 1, m))
     points = torch.cat((points, points[:1].expand(d - z, -1, -1, -1)))
     parameters = Parameters.from_vector(moved)
-    world = native.world_of(
-        scene_from_parameters(
-            shape, parameters, place_points(points, parameters.scale, parameters.mount)
-        )
+    scenes = scene_from_parameters(
+        shape, parameters, place_points(points, parameters.scale, parameters.mount)
     )
+    offsets = torch.stack([body.offset for body in scenes.terrains], dim=-1)
     parts = []
-    for flat in (world.points, world.offsets, world.friction):
-        value = flat.reshape(d + 1, m, *flat.shape[1:])
-        parts.append(np.ascontiguousarray((value[1:] - value[0]).swapaxes(0, 1)) / _DIFFERENCE)
+    for value in (scenes.points_ee.mT, offsets, scenes.friction):
+        moves = (value[1:] - value[0]).transpose(0, 1).contiguous() / _DIFFERENCE
+        parts.append(moves.detach().numpy())
     first = Parameters.from_vector(vectors)
     scene = scene_from_parameters(shape, first, place_points(points[0], first.scale, first.mount))
     setting, outcome = history.setting(scene), None
@@ -82,7 +81,7 @@ def linearised_likelihood(
         twice = torch.arange(m).repeat(2)
         points_ee, sd, setting = points_ee[twice], torch.cat((sd, moved_sd)), setting[twice]
         parts = [np.concatenate((part, np.zeros_like(part))) for part in parts]
-    found = compiled_filter(
+    found = filter_history(
         points_ee, setting, sd, field, settings, innovations=True, by_theta=SceneSlopes(*parts)
     )
     if moved_sd is None:

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
 
-from tpcd.simulator.kernel import source_stamp
+from tpcd.loops import njit
+from tpcd.simulator.batch import source_stamp
 
 
 class Components(NamedTuple):

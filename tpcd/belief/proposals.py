@@ -28,7 +28,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tpcd.belief.resampling import systematic_resample
-from tpcd.simulator import native
+from tpcd.threads import in_parts
 
 DEGREES_OF_FREEDOM = 5
 DAMPINGS = (0.0, 1.0, 4.0, 16.0, 64.0)
@@ -99,19 +99,9 @@ class CurvedMixture:
         log_peak = self.counts.log() - self.spread.log().sum(-1)
         highest = log_peak.max()
         peak = (log_peak - highest).exp()
-        if native.available() and points.device.type == "cpu":
-            total = self._compiled(points, peak)
-        else:
-            total = torch.cat([self._sum(part, peak) for part in points.split(_POINTS_AT_ONCE)])
-        return total.log() + highest + constant
+        return self._sum(points, peak).log() + highest + constant
 
     def _sum(self, points: Tensor, peak: Tensor) -> Tensor:
-        d, nu = self.offset.shape[-1], DEGREES_OF_FREEDOM
-        along = torch.einsum("kab,mb->mka", self.axes, points) - self.place
-        square = ((along[:, :, None] - self.offset) / self.spread).square().sum(-1)
-        return (peak * (1 + square / nu) ** (-(nu + d) / 2)).sum(1)
-
-    def _compiled(self, points: Tensor, peak: Tensor) -> Tensor:
         from tpcd.belief.mixture_kernel import Components, sum_range
 
         # The places last: the loops over them are the long ones.
@@ -135,7 +125,7 @@ def summed(
     """Sums of densities at points over components of each of t sizes, by a compiled loop."""
     total = torch.empty(len(points), sizes, dtype=torch.float64)
     given, found = points.contiguous().numpy(), total.numpy()
-    native.in_parts(
+    in_parts(
         lambda first, last: sum_range(given, components, DEGREES_OF_FREEDOM, found, first, last),
         len(points),
     )

@@ -23,7 +23,7 @@ from tpcd.belief.settings import EstimatorSettings
 from tpcd.belief.state import EstimatorState
 from tpcd.data.episode import Episode
 from tpcd.shape.protocol import Shape
-from tpcd.simulator.native import torch_in_one_thread
+from tpcd.threads import torch_in_one_thread
 
 
 @torch_in_one_thread

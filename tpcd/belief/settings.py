@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from tpcd.effects.protocol import Effect
 from tpcd.effects.shape_change import UNCHANGED, ShapeChange
 from tpcd.simulator import StepSettings
-from tpcd.simulator.native import available
 
 
 @dataclass(frozen=True)
@@ -117,13 +116,6 @@ CLOSING_SAMPLER = SamplerSettings(
     rough=False,
 )
 """Budget of the belief that is left once no more data are to come."""
-CLOSING_SHARE_WITHOUT_LOOPS = 0.125
-"""Share of it that is taken where the compiled loops are missing."""
-
-
-def default_closing() -> SamplerSettings:
-    """`CLOSING_SAMPLER`, or a share of it where numba is not installed and all takes longer."""
-    return CLOSING_SAMPLER if available() else CLOSING_SAMPLER.scaled(CLOSING_SHARE_WITHOUT_LOOPS)
 
 
 @dataclass(frozen=True)
@@ -132,7 +124,7 @@ class EstimatorSettings:
 
     sampler: SamplerSettings = field(default_factory=SamplerSettings)
     """Budget of the sampler after each transition."""
-    closing: SamplerSettings = field(default_factory=default_closing)
+    closing: SamplerSettings = CLOSING_SAMPLER
     """Budget once no more data are to come (see `refine`), for as many particles as the other."""
     closing_passes: int = 4
     """Times at most that mixtures in flat coordinates are adapted, each time from where draws of

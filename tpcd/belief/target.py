@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tpcd.belief.filtered import HistoryLikelihood
+from tpcd.belief.filter import HistoryLikelihood
 from tpcd.belief.flattening import Flattening, flattening
 from tpcd.belief.history import History
 from tpcd.belief.likelihood import AT_ONCE, history_likelihood, in_groups
@@ -18,7 +18,7 @@ from tpcd.belief.misfit import MisfitField
 from tpcd.belief.prior import ParameterPrior
 from tpcd.belief.setting import merge
 from tpcd.effects.conditions import Outcome
-from tpcd.simulator import ContactMode, StepSettings, native
+from tpcd.simulator import ContactMode, StepSettings
 
 _LARGE_MISFIT = 2.0
 """Added to the score of the misfit's size."""
@@ -99,19 +99,8 @@ class ContactTarget:
         return gradient + torch.cat((rise, -score[:, -1:]), dim=-1), information
 
     def _linearised(self, score: Tensor) -> _Linearised:
-        """Innovations and their derivatives: compiled for theta and by a difference for the
-        size of the misfit; by differences throughout where compiled loops are not to be had."""
-        s = score.shape[-1]
-        if not native.available() or score.device.type != "cpu":
-            steps = torch.diag(score.new_full((s,), _DIFFERENCE))
-            moved = score + torch.cat((score.new_zeros(1, s), steps))[:, None]
-            found = self.evaluate(moved.flatten(0, 1), innovations=True)
-            parts = (found.whitened, found.log_scale)
-            whitened, log_scale = (_known(p).unflatten(0, (s + 1, -1)) for p in parts)
-            slopes, stretch = (
-                ((v[1:] - v[0]) / _DIFFERENCE).movedim(0, 1) for v in (whitened, log_scale)
-            )
-            return _Linearised(whitened[0], slopes, stretch)
+        """Innovations and their derivatives: exact for theta, by a difference for the size of the
+        misfit."""
         assert self.history is not None
         vectors, slope = self.prior.to_vector_with_slope(score[:, :-1])
         scene, added = self.prior.scene_dimension, self.prior.added_of(vectors)
@@ -134,11 +123,11 @@ class ContactTarget:
         # Effects and the size of the misfit by differences. That contact forces, to which effects
         # answer, change too is left out: with surfaces that yielded so it was 3 % of a standard
         # deviation.
-        for entry in range(scene, s):
+        for entry in range(scene, score.shape[-1]):
             moved = score.clone()
             moved[:, entry] += _DIFFERENCE
             there = moved_misfit
-            if entry < s - 1:  # The last is the size of the misfit.
+            if entry < score.shape[-1] - 1:  # The last is the size of the misfit.
                 there = self.evaluate(moved, innovations=True, outcome=outcome)
             parity, parity_scale = self.parity(moved)
             found = torch.cat((_known(there.whitened), parity), dim=1)

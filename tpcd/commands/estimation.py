@@ -20,7 +20,6 @@ from typing import Any
 from tqdm import tqdm
 
 from tpcd.belief.belief import Belief, EstimationStep
-from tpcd.belief.settings import CLOSING_SHARE_WITHOUT_LOOPS
 from tpcd.belief.state import STATE_FILE, EstimatorState, save_state
 from tpcd.belief.storage import load_belief, save_belief
 from tpcd.commands.drawing import KnownTruth, draw_estimation
@@ -32,18 +31,12 @@ from tpcd.errors import RunError
 from tpcd.exploration import Closing
 from tpcd.files import named, write_json, write_text
 from tpcd.records import fitting
-from tpcd.simulator.native import available
 
 STEPS_FILE, SUMMARY_FILE = "steps.jsonl", "summary.json"
 FEW_DRAWS = 10
 """Effective sample size under which a belief is not to be trusted."""
 HEAVY_TAIL = 0.7
 """Shape of the largest weights over which the belief is not to be trusted (see `pareto`)."""
-WITHOUT_LOOPS = "warning: there is no numba, so that each step takes about 20 times as long"
-FEWER_DRAWS = f" and the last belief gets {CLOSING_SHARE_WITHOUT_LOOPS:.1%} of its draws"
-LOOPS = "; for the compiled loops: pip install 'tpcd[fast]'"
-"""What is told of the compiled loops where they are missing; the middle part where there is a
-closing."""
 
 
 def run_estimation(
@@ -99,11 +92,7 @@ class EstimationRun:
         self._lines = self._open.enter_context(lines)
         bar = tqdm(total=self._total, initial=self._done, unit="step", disable=not self._show)
         self.bar = self._open.enter_context(bar)
-        if available():
-            self.bar.set_postfix_str("the first step also compiles, once on a machine")
-        elif self._show:
-            fewer = FEWER_DRAWS if self._closing else ""
-            self.bar.write(WITHOUT_LOOPS + fewer + LOOPS, file=sys.stderr)
+        self.bar.set_postfix_str("the first step also compiles, once on a machine")
         return self
 
     def __exit__(self, *error: object) -> None:

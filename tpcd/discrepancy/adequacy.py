@@ -20,16 +20,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.compiled import compiled_filter
-from tpcd.belief.filtered import filter_history
+from tpcd.belief.filter import OUTLIER_SQUARE, filter_history
 from tpcd.belief.history import History
-from tpcd.belief.kalman import OUTLIER_SQUARE
 from tpcd.belief.likelihood import effective_setting, outcome_of
 from tpcd.contact import scene_from_parameters
 from tpcd.discrepancy.diagnosis import CHANNELS, Cell
 from tpcd.discrepancy.fit import Fit, Question
 from tpcd.effects.conditions import FLOOR, WALL, Outcome
-from tpcd.simulator import native
 
 DRAWS = 4000
 """Draws of standard normal numbers for the largest score."""
@@ -147,8 +144,7 @@ def _residuals(
     scene = scene_from_parameters(prior.shape, prior.parameters_of(vectors))
     added = prior.added_of(vectors)
     setting, _ = effective_setting(scene, history, sd, question.misfit, fit.step, added)
-    run = compiled_filter if native.available() else filter_history
-    found = run(
+    found = filter_history(
         scene.points_ee, setting, sd, question.misfit, fit.step, innovations=True, steps=True
     )
     assert found.whitened is not None and found.steps is not None

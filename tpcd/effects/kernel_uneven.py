@@ -7,7 +7,8 @@ import math
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
+
+from tpcd.loops import njit
 
 
 class Profile(NamedTuple):

@@ -24,9 +24,7 @@ from tpcd.effects.conditions import FLOOR, Conditions, Outcome, Rows
 from tpcd.effects.declare import DeclaredEffect, column
 from tpcd.effects.geometry import with_plane
 from tpcd.effects.protocol import EffectParameter
-from tpcd.planar import rotate
-from tpcd.simulator import native
-from tpcd.simulator.step import needs_gradient
+from tpcd.threads import in_parts
 
 Relief = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """From the k parameters (m, k) of an effect and places x (m, r, p) [m] along the floor to heights
@@ -36,7 +34,8 @@ NEAR = 0.02
 _RAMP = 0.0025
 """Half width of the ramp at a step of the floor [m]."""
 _PITCH, _LONGEST = 0.00025, 2.0
-"""In compiled loops a relief is looked up between places so far apart, along so much floor [m]."""
+"""A relief is looked up between places so far apart, along so much floor [m]; as much further apart
+as there is more of it."""
 _PARTS, _PASSES = 2, 2
 """As in `Effect`: more of either leave fewer rows wrong, and take longer (`eval/EVIDENCE.md`)."""
 
@@ -57,7 +56,7 @@ def on_uneven(
     normal = conditions.normal[:, :, FLOOR].expand(*view.shape[:2], 2)
     offset = conditions.offset[:, :, FLOOR].expand(view.shape[:2])
     seen = _Seen(outcome.outline, view, normal, offset, stays)
-    warp, normal, offset = _laid_compiled(seen, values, relief) or _laid(seen, values, relief)
+    warp, normal, offset = _laid(seen, values, relief)
     if bool(warp.any()):
         warp = conditions.warp + warp if conditions.warps else warp
         conditions = replace(conditions, warp=warp)
@@ -80,43 +79,18 @@ _Laid = tuple[Tensor, Tensor, Tensor]
 
 
 def _laid(seen: _Seen, values: Tensor, relief: Relief) -> _Laid:
-    """Outlines over a relief."""
-    outline, view, normal, offset, stays = seen
-    angle = view[..., 2:]
-    x, z = (rotate(angle, outline[:, None]) + view[..., None, :2]).unbind(-1)
-    rise, slope = relief(values, x)
-    flat = stays[:, None] | ((rise == 0) & (slope == 0)).all(-1, keepdim=True)
-    across, along = normal[..., :1], normal[..., 1:]
-    floor = (offset[..., None] - across * x) / along + rise
-    slope = slope - across / along
-    gap = z - floor
-    nearest = (gap * (1 + slope**2).rsqrt()).argmin(-1, keepdim=True)
-    at_x, at_z, steep = (value.gather(-1, nearest) for value in (x, floor, slope))
-    above = z - (at_z + steep * (x - at_x))
-    up = torch.where(gap < NEAR, gap, above.clamp_min(NEAR)) - above
-    up = torch.where(flat, 0.0, up)
-    length = (1 + steep**2).sqrt()
-    tangent = torch.cat((-steep, torch.ones_like(steep)), dim=-1) / length
-    through = torch.where(flat[..., 0], offset, ((at_z - steep * at_x) / length)[..., 0])
-    warp = up[..., None] * torch.stack((angle.sin(), angle.cos()), dim=-1)
-    return warp, torch.where(flat, normal, tangent), through
-
-
-def _laid_compiled(seen: _Seen, values: Tensor, relief: Relief) -> _Laid | None:
-    """The same in compiled loops, with the relief looked up; None where that cannot be."""
-    outline, view, normal, offset, stays = seen
-    inputs = (outline, view, normal, offset, values)
-    if view.device.type != "cpu" or not native.available() or needs_gradient(*inputs):
-        return None
-    x, reach = view[..., 0].nan_to_num(), float(outline.norm(dim=-1).nan_to_num().max())
-    first = math.floor((float(x.min()) - reach) / _PITCH)
-    cells = math.ceil((float(x.max()) + reach) / _PITCH) - first
-    if cells * _PITCH > _LONGEST:
-        return None
+    """Outlines over a relief, which is looked up."""
     from tpcd.effects.kernel_uneven import Laid, Profile, lay_range
 
+    outline, view, normal, offset, stays = seen
+    x, reach = view[..., 0].nan_to_num(), float(outline.norm(dim=-1).nan_to_num().max())
+    least, most = float(x.min()) - reach, float(x.max()) + reach
+    pitch = _PITCH * max(1, math.ceil((most - least) / _LONGEST))
+    first = math.floor(least / pitch)
+    cells = math.ceil(most / pitch) - first
+
     # Multiples of the pitch, so that where others are changes nothing.
-    places = _PITCH * torch.arange(first, first + cells + 1, dtype=view.dtype)
+    places = pitch * torch.arange(first, first + cells + 1, dtype=view.dtype)
     count, rows, points = *view.shape[:2], outline.shape[1]
     rise, slope = (
         part[:, 0].expand(count, -1).contiguous().numpy()
@@ -125,8 +99,8 @@ def _laid_compiled(seen: _Seen, values: Tensor, relief: Relief) -> _Laid | None:
     shapes = ((count, rows, 2), (count, rows), (count, rows, 2, points))
     laid = Laid(*(np.empty(shape) for shape in shapes))
     given = (value.contiguous().numpy() for value in (outline.mT, view, normal, offset, stays))
-    work = partial(lay_range, *given, Profile(rise, slope, first, _PITCH), NEAR, laid)
-    native.in_parts(work, count, rows)
+    work = partial(lay_range, *given, Profile(rise, slope, first, pitch), NEAR, laid)
+    in_parts(work, count, rows)
     tangent, through, warp = (torch.from_numpy(value) for value in laid)
     return warp.mT, tangent, through
 

@@ -1,4 +1,4 @@
-"""The contact problem, its answer and its status: what goes in and out of every engine.
+"""The contact problem, its answer and its status: what goes in and out of every backend.
 
 A contact problem is a small strictly convex quadratic programme in a motion v (n
 variables) with one-sided rows (m of them) and, optionally, a compliance of each row:
@@ -17,7 +17,7 @@ H is the stiffness, lambda the contact forces in the row directions. Axes: any b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import torch
@@ -44,7 +44,7 @@ class Status(IntEnum):
     )
     ITERATION_LIMIT = (
         2,
-        "Not solved: the engine stopped at its iteration limit or short of its accuracy; "
+        "Not solved: the solver stopped at its iteration limit or short of its accuracy; "
         "read the residual before using the motion.",
     )
     INVALID_INPUT = (
@@ -84,6 +84,10 @@ class ContactQP:
     """How far each row yields for a unit multiplier, >= 0; None means that all are rigid."""
     row_mask: Bool[Tensor, "*batch m"] | None = None
     """False marks padding: the row is ignored whatever it holds, NaN included."""
+
+    def to(self, device: str | torch.device) -> ContactQP:
+        """The same problems on a device."""
+        return replace(self, **_moved(self, device))
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -126,7 +130,11 @@ class QPSolution:
     status: Int[Tensor, "*batch"]
     """Codes of `Status`."""
     iterations: Int[Tensor, "*batch"]
-    """Steps of the engine: rows added plus rows dropped, or interior-point steps."""
+    """Steps of the solver: rows added plus rows dropped, or interior-point steps."""
+
+    def to(self, device: str | torch.device) -> QPSolution:
+        """The same answers on a device."""
+        return replace(self, **_moved(self, device))
 
     @property
     def solved(self) -> Bool[Tensor, "*batch"]:
@@ -206,3 +214,7 @@ def _broadcasts_to(shape: torch.Size, batch: torch.Size) -> bool:
         return False
     pairs = zip(reversed(shape), reversed(batch), strict=False)
     return all(given in (1, wanted) for given, wanted in pairs)
+
+
+def _moved(record: ContactQP | QPSolution, device: str | torch.device) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in vars(record).items() if value is not None}

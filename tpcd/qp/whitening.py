@@ -1,10 +1,10 @@
-"""Contact problems in whitened variables, where every engine's arithmetic is the same.
+"""Contact problems in whitened variables, where every solver's arithmetic is the same.
 
 With H = L L^T and w = L^T (v - target) the objective is 1/2 |w|^2, a row a becomes
 g = L^-1 a and its offset c = a·target + b. Rows are then divided by their length, so that
 violations of different rows compare and one tolerance serves all units. A compliance e
 is one more variable s of its own for its row: g·w + sqrt(e) s + c >= 0 with 1/2 s^2 added
-to the objective; at the optimum s = sqrt(e) lambda. So engines only ever see rigid rows.
+to the objective; at the optimum s = sqrt(e) lambda. So solvers only ever see rigid rows.
 
 Layout: batch on the LAST axis (`n m b`, `m b`, `b`), float64. All sums run in a fixed
 order in elementwise operations, so that an element's bits do not depend on its

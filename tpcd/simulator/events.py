@@ -1,94 +1,121 @@
-"""Where on the path contact is expected to change next.
+"""Where on the path contact is expected to change next, and passing on to there.
 
 As long as contact stays as it is, the loads of its rows and the gaps of the other terrains change
 in proportion to the path, to first order. Contact changes where the first of them comes to zero:
 a contact is lost, comes to the edge of its friction cone, or another terrain is touched. Locating
 such changes and starting anew there is the event-driven scheme for nonsmooth systems (Acary and
 Brogliato, "Numerical Methods for Nonsmooth Dynamical Systems", 2008).
+
+An event is (which, point, inverse): the one of k rows whose load comes to zero, or k + t where the
+point touches terrain t, and the inverse of the rate at which that load or gap falls.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import no_type_check
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+import numpy as np
 
-from tpcd.contact import ContactScene, contact_frame
-from tpcd.simulator.implicit import LinearResponse
-from tpcd.simulator.lowest import lowest_points
-from tpcd.simulator.record import ContactSet
+from tpcd.loops import inner
+from tpcd.simulator.geometry import lowest_point, object_normal
+from tpcd.simulator.response import respond
 
 SLOWEST = 1e-3
 """Share of a load or gap that must be lost on a whole path for its end to be foreseen."""
+NOTHING = (-1, 0, 0.0)
+"""No event."""
 
 
-@dataclass(frozen=True)
-class Event:
-    """The next change of contact: share of the path until then, infinite if none is foreseen, the
-    pose's `rate` of change with the share [m, m, rad], and the derivatives of `ahead` by start and
-    command of the settling [1/m, 1/m, 1/rad] and by gap and lever of each terrain [1/m].
+@inner(error_model="numpy")
+@no_type_check
+def next_event(world, o, chains, law, before, command, pose, space, rate):
+    """Share of the path from `before` to `command` until contact changes, and the event.
+
+    `linear_system` must be filled for the pose. Leaves the pose's rate of change in `rate`.
     """
-
-    ahead: Float[Tensor, " b"]
-    rate: Float[Tensor, "b 3"]
-    start: Float[Tensor, "b 3"]
-    command: Float[Tensor, "b 3"]
-    gap: Float[Tensor, "b t"]
-    lever: Float[Tensor, "b t"]
-
-
-def next_event(
-    scene: ContactScene,
-    pose: Float[Tensor, "b 3"],
-    contacts: ContactSet,
-    multiplier: Float[Tensor, "b k"],
-    response: LinearResponse,
-    way: Float[Tensor, "b 3"],
-) -> Event:
-    """Where contact changes next, at a settled pose on a path whose command moves by `way`.
-
-    `way` is [m, m, rad], `multiplier` [N]; `multiplier` and `pose` may carry derivatives, which
-    `ahead` then has too.
-    """
-    rate = (response.command @ way[..., None])[..., 0]
-    lost = (response.load_command @ way[..., None])[..., 0]
-    margin, slope = [multiplier], [torch.where(contacts.multiplier > 0, lost, 0.0)]
-    by_start, by_command = [response.load_start], [response.load_command]
-    by_gap, by_lever = [response.load_gap.mT], [response.load_lever.mT]
-    _, lowest = lowest_points(scene, pose.detach(), pose.new_zeros(*scene.friction.shape, 1))
-    for t, body in enumerate(scene.terrains):
-        frame = contact_frame(scene.points_ee, body, pose, lowest[:, t])
-        row = frame.normal_row[:, 0].detach()
-        touched = ((contacts.terrain == t) & (contacts.multiplier > 0)).any(-1)
-        margin.append(frame.gap)
-        slope.append(torch.where(touched, 0.0, (row * rate).sum(-1))[:, None])
-        by_start.append(row[:, None, :] @ response.start)
-        by_command.append(row[:, None, :] @ response.command)
-        own = torch.zeros_like(scene.friction)
-        own[:, t] = 1.0
-        by_gap.append(own[:, None, :] + row[:, None, :] @ response.gap.mT)
-        by_lever.append(row[:, None, :] @ response.lever.mT)
-    margins, slopes = torch.cat(margin, -1), torch.cat(slope, -1)
+    margins, k = space.margins, len(space.room)
+    for j in range(k):
+        space.right[j] = -space.system.violated[j]
+    for a in range(3):
+        space.force[a] = -space.system.unbalanced[a]
+    respond(space)
+    for j in range(k):
+        margins[j] = space.multiplier[j] + space.gain[j]
+        space.right[j] = 0.0
+    for a in range(3):
+        space.force[a] = law.stiffness[a] * (command[a] - before[a])
+    respond(space)
+    for a in range(3):
+        rate[a] = space.change[a]
+    ahead, which, point, inverse = np.inf, -1, 0, 0.0
+    for j in range(k):
+        margin, slope = max(margins[j], 0.0), space.gain[j]
+        if space.chosen[j, 0] >= 0 and slope < -SLOWEST * margin and margin < -slope * ahead:
+            ahead, which, inverse = -margin / slope, j, -1.0 / slope
+    turn = (math.cos(pose[2]), math.sin(pose[2]))
+    for t in range(world.normals.shape[1]):
+        touched = False
+        for j in range(k):
+            touched = touched or space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t
+        if touched:
+            continue
+        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        low, lowest = lowest_point(world, o, chains, t, u, v)
+        margin = max(low + nx * pose[0] + nz * pose[1] - world.offsets[o, t], 0.0)
+        across = v * world.points[o, 0, lowest] - u * world.points[o, 1, lowest]
+        slope = nx * rate[0] + nz * rate[1] + across * rate[2]
+        if slope < -SLOWEST * margin and margin < -slope * ahead:
+            ahead, which, point, inverse = -margin / slope, k + t, lowest, -1.0 / slope
     # What is not above zero, by rounding, changes here and now, whatever moves.
-    margins = torch.where(margins.detach() > 0, margins, 0.0)
-    falls = slopes < -SLOWEST * margins.detach()
-    inverse = torch.where(falls, -1.0 / torch.where(falls, slopes, 1.0), 0.0)
-    ahead = torch.where(falls, margins * inverse, torch.inf)
-    first = ahead.detach().argmin(-1, keepdim=True)
-    inverse = torch.where(margins.detach() > 0, inverse, 0.0).gather(-1, first)
+    return ahead, (which, point, inverse if ahead > 0.0 else 0.0)
 
-    def derivative(parts: list[Tensor]) -> Tensor:
-        values = torch.cat(parts, dim=1)
-        index = first[..., None].expand(-1, 1, values.shape[-1])
-        return inverse * values.gather(1, index)[:, 0]
 
-    return Event(
-        ahead=ahead.gather(-1, first)[:, 0],
-        rate=rate,
-        start=derivative(by_start),
-        command=derivative(by_command),
-        gap=derivative(by_gap),
-        lever=derivative(by_lever),
-    )
+@inner
+@no_type_check
+def respond_until(world, o, law, event, pose, space, slopes):
+    """Turn the response of a settling into that of the pose at the event."""
+    which, point, inverse = event
+    response, by_terrain, system = slopes.response, slopes.by_terrain, space.system
+    terrains, row, k = slopes.land_gap.shape[0], space.right, len(space.room)
+    if which >= k:
+        touch_row(world, o, which - k, point, pose, row)
+    for c in range(3):
+        by_start, by_command = 0.0, 0.0
+        if which >= k:
+            for a in range(3):
+                by_start += row[a] * response[a, c]
+                by_command += row[a] * response[3 + a, c]
+        else:
+            for i in range(k):
+                share = system.inverse[which, i]
+                by_start -= share * system.starts[i, c]
+                by_command -= share * system.rows[i, c] * system.soft[c] * law.stiffness[c]
+        for a in range(3):
+            response[a, c] += slopes.rate[a] * inverse * by_start
+            response[3 + a, c] += slopes.rate[a] * inverse * by_command
+    for t in range(terrains):
+        by_gap, by_lever = 1.0 if t == which - k else 0.0, 0.0
+        if which >= k:
+            for a in range(3):
+                by_gap += row[a] * by_terrain[t, a]
+                by_lever += row[a] * by_terrain[terrains + t, a]
+        else:
+            for i in range(k):
+                share = system.inverse[which, i]
+                if space.chosen[i, 0] >= 0 and space.chosen[i, 1] == t:
+                    by_gap -= share
+                by_lever -= share * system.rows[i, 2] * system.soft[2] * space.load[t]
+        for a in range(3):
+            by_terrain[t, a] += slopes.rate[a] * inverse * by_gap
+            by_terrain[terrains + t, a] += slopes.rate[a] * inverse * by_lever
+
+
+@inner
+@no_type_check
+def touch_row(world, o, t, point, pose, row):
+    """How the gap of a point to terrain t moves with the pose."""
+    u, v = object_normal(world, o, t, math.cos(pose[2]), math.sin(pose[2]))
+    row[0], row[1] = world.normals[o, t, 0], world.normals[o, t, 1]
+    row[2] = v * world.points[o, 0, point] - u * world.points[o, 1, point]

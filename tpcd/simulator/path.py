@@ -1,142 +1,144 @@
-"""One step of a flat batch in torch, with derivatives: rest, and the command's path at once, or in
-parts where contact changes or turns. `kernel_element` is the same in compiled loops.
+"""How the path of a command is cut into parts, since friction depends on the path.
+
+One settling of a part answers for its end alone, which is right as long as contact is the same all
+the way, and also where a single contact begins to slip or is lost: then the end does not depend on
+where that happened. Where a contact that slipped comes to stick, it does, since it sticks to the
+place where it stopped; and where floor and wall are touched, what one does depends on when the
+other let go. Changes of contact on such a path are located. `LOOK` goes just far enough to see what
+contact does in this direction, `AIM` goes nearly to where the first load or gap then comes to zero
+at its rate (see `events`) and passes on to it, and `LOOK` sees what contact does beyond. Where none
+is foreseen, `TRY` goes on as far as the path is straight. What no load foretells, as that a turning
+object slips back, is closed in on by halving.
+
+Contact modes are two bits for each terrain (see `ContactMode`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from typing import no_type_check
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from tpcd.contact import ContactScene
-from tpcd.planar import wrap_angle
-from tpcd.simulator.flight import FREE_GAP
-from tpcd.simulator.lowest import lowest_points
-from tpcd.simulator.part import Part, State, advance, start_state, whole
-from tpcd.simulator.record import (
-    START_DEPTH,
-    ContactMode,
-    StepSettings,
-    StepStatus,
-    Transition,
-)
-from tpcd.simulator.rest import terrain_gaps_under
-from tpcd.simulator.settle import own
-from tpcd.simulator.walk import (
-    AIM,
-    ALMOST,
-    GLANCE,
-    LOOK,
-    MOST_SOUGHT,
-    PASSED,
-    TRY,
-    ends_alike,
-    least_part,
-    next_part,
-    part_end,
-    parts_of_path,
-    shorter_part,
-)
+from tpcd.loops import njit
+
+TRY, LOOK, AIM = 0, 1, 2
+"""Kinds of parts, as in the file's opening."""
+GLANCE = 1 / 1024
+"""Share of the path that `LOOK` goes."""
+SHY = 0.995
+"""Share of the way to an expected change of contact that is settled; the rest is passed at the rate
+found there."""
+PASSED = 0.02
+"""Most that is passed so, as a share of what was settled. How the rate moves is left out of the
+derivatives, whose error this keeps small."""
+ALMOST = 1e-9
+"""Share of a part that is no part of its own."""
+MOST_SOUGHT = 16
+"""Parts of a path that aim at a change of contact or are shortened; where it chatters, the rest is
+taken as it is."""
 
 
-def follow_path(
-    scene: ContactScene,
-    start: Tensor,
-    previous: Tensor | None,
-    command: Tensor,
-    stiffness: Tensor,
-    settings: StepSettings,
-) -> Transition:
-    """Step finite elements (b): rest on what was touched, go to the command, and in parts along its
-    path where contact changes on the way or what is touched turns (see `walk`), unless the parts
-    end worse than the whole."""
-    start, stiffness, scene = start.double(), stiffness.double(), scene.double()
-    command = _unwrapped(command.double(), start)
-    begin = start_state(scene, start)
-    rested = previous is None
-    if rested:
-        gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
-        sticks = (gaps[..., 0] <= FREE_GAP).long() * int(ContactMode.STICK)
-        begin, path_start = replace(begin, mode=sticks), start
-    else:
-        path_start = _unwrapped(previous.double(), start)
-        rest = whole(path_start, path_start, rested=False)
-        begin = advance(scene, begin, rest, stiffness, settings)
-        begin = replace(
-            begin,
-            status=torch.zeros_like(begin.status),
-            residual=torch.zeros_like(begin.residual),
-        )
-    inside = -terrain_gaps_under(scene, start, begin.contacts[..., 0].detach()).amin(-1)
-    at_once = whole(path_start, command, rested)
-    end = advance(scene, begin, at_once, stiffness, settings)
-    turn = (command - path_start)[:, 2].detach()
-    parts = parts_of_path(settings, turn, begin.mode, end.mode, end.slid)
-    if bool((parts > 1).any()):
-        seeks = ~ends_alike(begin.mode, end.mode, end.slid)
-        walked = _walk(scene, begin, path_start, command, parts, seeks, rested, stiffness, settings)
-        end = walked.where((parts > 1) & (walked.status <= end.status), end)
-    pushed = (inside > START_DEPTH) & (end.status == int(StepStatus.CONVERGED))
-    return Transition(
-        pose=torch.cat((end.pose[:, :2], wrap_angle(end.pose[:, 2:])), dim=-1),
-        wrench=stiffness * (end.pose - command),
-        mode=end.mode,
-        status=torch.where(pushed, int(StepStatus.START_INSIDE), end.status),
-        residual=end.residual,
-        pose_from_start=end.from_start,
-        pose_from_gap=end.from_gap,
-        pose_from_lever=end.from_lever,
-        contacts=end.contacts,
-    )
+@njit(_nrt=False)
+@no_type_check
+def ends_alike(before, now, terrains, slid):
+    """Whether the end of a part, with contact modes `before` it and `now` at its end, does not
+    depend on where on the way contact changed.
+
+    Where the same terrains are touched and no point has `slid`, modes are what the loads happen to
+    be: between two terrains the law leaves them open.
+    """
+    if now == before or now == 0:
+        return True
+    loaded, loaded_before, slips, same = 0, 0, False, True
+    for t in range(terrains):
+        mode, mode_before = now >> 2 * t & 3, before >> 2 * t & 3
+        loaded += mode > 0
+        loaded_before += mode_before > 0
+        slips = slips or mode > 1 and mode_before > 0
+        same = same and (mode > 0) == (mode_before > 0)
+    if same and not slid:
+        return True
+    return loaded == 1 and (loaded_before == 0 or loaded_before == 1 and slips)
 
 
-def _walk(
-    scene: ContactScene,
-    state: State,
-    path_start: Tensor,
-    command: Tensor,
-    parts: Tensor,
-    seeks: Tensor,
-    rested: bool,
-    stiffness: Tensor,
-    settings: StepSettings,
-) -> State:
-    """The end of the path in parts, for the elements that have more than one; where `seeks`,
-    changes of contact are located from the start."""
-    done = torch.where(parts > 1, 0.0, torch.ones_like(command[:, 0]))
-    longest = 1.0 / parts.to(done)
-    spent, moving = torch.zeros_like(parts), torch.zeros_like(seeks)
-    seeks = seeks & (settings.finest < 1)
-    kinds = torch.where(seeks, LOOK, TRY)
-    length = torch.where(seeks, GLANCE, longest)
-    while bool((done < 1).any()):
-        index = torch.nonzero(done < 1).flatten()
-        kind, before, every = kinds[index], done[index], parts[index]
-        share = part_end(before, length[index], every)
-        gone, left = share - before, part_end(before, longest[index], every) - share
-        room = torch.where(kind == AIM, left.minimum(PASSED * gone), 0.0)
-        part = Part(path_start[index], command[index], share, rested, room)
-        here = State(**{name: value[index] for name, value in vars(state).items()})
-        there = advance(scene.gather(index), here, part, own(stiffness, index), settings)
-        idle = (spent[index] == MOST_SOUGHT) | (settings.finest == 1)
-        fits = ends_alike(here.mode, there.mode, there.slid) | idle
-        fits = fits | (gone <= least_part(kind, settings.finest) * (1 + ALMOST))
-        spent[index] += (~idle & ((kind == AIM) | ~fits)).long()
-        seeks[index] = (seeks[index] | ~fits) & (spent[index] < MOST_SOUGHT)
-        reached = torch.where(fits, share + there.passed, before)
-        left = part_end(reached, longest[index], every) - reached
-        onward, straight = next_part(there.passes, seeks[index], there.ahead - there.passed, left)
-        shorter, shortened = shorter_part(kind, moving[index], here.ahead, gone, settings.finest)
-        kinds[index] = torch.where(fits, onward, shorter)
-        length[index] = torch.where(fits, straight, shortened)
-        moving[index] |= fits
-        done[index] = reached
-        state = state.put(index, there.where(fits, here))
-    return state
+@njit(_nrt=False)
+@no_type_check
+def parts_of_path(request, turn, before, now, terrains, slid):
+    """Into how many parts the path is cut, after it was gone at once."""
+    if request.substeps == 1:
+        return 1
+    parts = 1
+    if request.follow_path or not ends_alike(before, now, terrains, slid):
+        parts = request.substeps
+    if now != 0 or before != 0:
+        parts = max(parts, math.ceil(abs(turn) / request.largest_turn - ALMOST))
+    return parts
 
 
-def _unwrapped(command: Tensor, start: Tensor) -> Tensor:
-    """The command with its angle turned by full turns to be the one nearest to the start's."""
-    turn = start[:, 2:] + wrap_angle(command[:, 2:] - start[:, 2:])
-    return torch.cat((command[:, :2], turn), dim=-1)
+@njit(_nrt=False)
+@no_type_check
+def part_end(done, length, parts):
+    """Where the next part ends, as a share of the path."""
+    share = min(done + length, (math.floor(done * parts + ALMOST) + 1.0) / parts)
+    return share if share < 1.0 - ALMOST else 1.0
+
+
+@njit(_nrt=False)
+@no_type_check
+def least_part(kind, finest):
+    """Parts of a kind that are not shortened any more."""
+    if kind == LOOK:
+        return np.inf
+    return finest if kind == TRY else GLANCE
+
+
+@njit(_nrt=False)
+@no_type_check
+def next_part(passes, seeks, ahead, left):
+    """Kind and length of the part after one that was right."""
+    if passes:
+        return LOOK, GLANCE
+    if seeks and SHY * ahead < left:
+        return AIM, max(SHY * ahead, GLANCE)
+    return TRY, left
+
+
+@njit(_nrt=False)
+@no_type_check
+def shorter_part(kind, moving, ahead, gone, finest):
+    """Kind and length of the part in place of one of length `gone` on which contact changed."""
+    if not moving:
+        return LOOK, GLANCE
+    if kind == TRY and SHY * ahead < gone:
+        return AIM, max(SHY * ahead, GLANCE)
+    if kind == AIM:
+        return AIM, max(0.5 * gone, GLANCE)
+    return TRY, max(0.5 * gone, finest)
+
+
+@njit(_nrt=False)
+@no_type_check
+def sticking(mask, terrains):
+    """Contact modes of an object that rests on the terrains of a bit mask."""
+    modes = 0
+    for t in range(terrains):
+        modes |= (mask >> t & 1) << 2 * t
+    return modes
+
+
+@njit(_nrt=False)
+@no_type_check
+def contact_modes(space, terrains):
+    """Contact modes, two bits for each terrain, from the row that carries its largest load."""
+    modes = 0
+    for t in range(terrains):
+        mode, largest = 0, 0.0
+        for j in range(len(space.room)):
+            load = space.multiplier[j]
+            if space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t and load > largest:
+                largest = load
+                slip = 2 if space.side[j] < 0.0 else 3
+                mode = slip if space.slipping[j] else 1
+        modes |= mode << 2 * t
+    return modes

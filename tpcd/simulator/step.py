@@ -1,34 +1,27 @@
 """The quasi-static model f_theta(x, u): where the arm comes to rest, and with which wrench.
 
-`simulate_step` answers a batch of (scene, start pose, command); `rollout` feeds it its own
-poses. Gradients flow through every input when one of them asks for it. Without gradients
-on a CPU where numba is installed, compiled loops do the same work.
+`simulate_step` answers a batch of (scene, start pose, command); `rollout` feeds it its own poses.
+Compiled loops make the step and, where one is asked for, its exact derivatives by every input:
+the answer is the same with and without. They run on the CPU, in float64.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import warnings
+from functools import cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from tpcd.contact import ContactScene
 from tpcd.contract import as_numbers, check_lengths, check_pose, check_stiffness, one_batch
-from tpcd.parameters import LARGEST_FRICTION
-from tpcd.simulator import native
-from tpcd.simulator.lowest import lowest_points
-from tpcd.simulator.path import follow_path
-from tpcd.simulator.record import (
-    ContactMode,
-    StepSettings,
-    StepStatus,
-    Transition,
-)
-from tpcd.simulator.settle import own
-from tpcd.terrain import OFF_UNIT, HalfPlane
+from tpcd.planar import wrap_angle
+from tpcd.simulator.engine import Answered, Asked, step
+from tpcd.simulator.record import StepSettings, StepStatus, Transition
 
-Engine = Literal["auto", "torch", "native"]
 DEFAULT_SETTINGS = StepSettings()
 
 
@@ -38,7 +31,6 @@ def simulate_step(
     command: Float[Tensor, "*#batch 3"],
     stiffness: Float[Tensor, "*#batch 3"],
     settings: StepSettings = DEFAULT_SETTINGS,
-    engine: Engine = "auto",
     previous: Float[Tensor, "*#batch 3"] | None = None,
     unusual: bool = False,
 ) -> Transition:
@@ -51,6 +43,12 @@ def simulate_step(
 
     The batch axes of `scene`, `pose`, the commands and the stiffness are broadcast against each
     other. `stiffness` is the diagonal of K [N/m, N/m, N·m/rad]. Contact is solved in float64.
+    Pose and wrench are differentiable once, by every floating input; at a change of contact the
+    derivative is that of the side on which the answer lies, of a touch that only grazes it leaves
+    out how its time changes, and where the object is jammed even without friction it is 0. A
+    terrain's direction counts by its angle. Of tensors on another device the step is made on the
+    CPU.
+
     Arrays and lists are taken for tensors. Raises TypeError and ValueError for what has not three
     numbers, a stiffness that is not positive and finite and, unless `unusual`, for what looks like
     millimetres, degrees or N/mm (see `tpcd.contract`). Numbers that make no scene are a status.
@@ -72,48 +70,35 @@ def simulate_step(
     names = ("pose", "command", "stiffness", "previous")
     shapes = {name: one.shape[:-1] for name, one in zip(names, given, strict=False)}
     batch = one_batch({"scene": scene.batch_shape, **shapes})
-    if stiffness.ndim > 1:
-        stiffness = stiffness.expand(*batch, 3).reshape(-1, 3)
-    pose = pose.expand(*batch, 3).reshape(-1, 3)
-    command = command.expand(*batch, 3).reshape(-1, 3)
-    previous = None if previous is None else previous.expand(*batch, 3).reshape(-1, 3)
-    owner = torch.arange(scene.batch_shape.numel(), device=pose.device)
-    owner = owner.reshape(scene.batch_shape).expand(batch).reshape(-1)
-    given = (pose, stiffness, command, *(() if previous is None else (previous,)))
-    compiled = _use_native(engine, scene, given)
-    yields = scene.yields.reshape(-1)[owner]
+    asked = _flat(scene, batch, pose, previous, command, stiffness)
+    yields = scene.yields.reshape(-1)[asked.scene.to(device)].cpu()
     groups = [torch.nonzero(group).flatten() for group in (~yields, yields) if bool(group.any())]
     if len(groups) < 2:
-        flat = _answer(compiled, scene, owner, pose, previous, command, stiffness, settings)
+        found = _settle(asked, settings)
     else:
         # Rigid scenes apart from those that yield: no answer depends on what is beside it.
-        parts = [
-            _answer(
-                compiled,
-                scene,
-                owner[index],
-                pose[index],
-                None if previous is None else previous[index],
-                command[index],
-                own(stiffness, index),
-                settings,
-            )
-            for index in groups
-        ]
+        parts = [_settle(_part(asked, index), settings) for index in groups]
         back = torch.cat(groups).argsort()
-        both = zip(vars(parts[0]).items(), vars(parts[1]).values(), strict=True)
-        flat = Transition(**{name: torch.cat((one, other))[back] for (name, one), other in both})
+        found = Answered(*(torch.cat(both)[back] for both in zip(*parts, strict=True)))
+    turn = asked.start[:, 2] + wrap_angle(asked.command[:, 2] - asked.start[:, 2])
+    away = found.pose - torch.cat((asked.command[:, :2], turn[:, None]), dim=-1)
+    # What has no answer touches no gradient of the others, with which it shares inputs.
+    invalid = (found.status == int(StepStatus.INVALID_INPUT))[:, None]
+    wrench = (asked.stiffness * away.masked_fill(invalid, 0.0)).masked_fill(invalid, torch.nan)
     terrains = len(scene.terrains)
+    values = {
+        "pose": (torch.cat((found.pose[:, :2], wrap_angle(found.pose[:, 2:])), dim=-1), (3,)),
+        "wrench": (wrench, (3,)),
+        "mode": (found.mode, (terrains,)),
+        "status": (found.status, ()),
+        "residual": (found.residual, ()),
+        "pose_from_start": (found.from_start, (3, 3)),
+        "pose_from_gap": (found.from_gap, (terrains, 3)),
+        "pose_from_lever": (found.from_lever, (terrains, 3)),
+        "contacts": (found.contacts, (terrains, 4)),
+    }
     return Transition(
-        pose=flat.pose.reshape(*batch, 3),
-        wrench=flat.wrench.reshape(*batch, 3),
-        mode=flat.mode.reshape(*batch, terrains),
-        status=flat.status.reshape(batch),
-        residual=flat.residual.reshape(batch),
-        pose_from_start=flat.pose_from_start.reshape(*batch, 3, 3),
-        pose_from_gap=flat.pose_from_gap.reshape(*batch, terrains, 3),
-        pose_from_lever=flat.pose_from_lever.reshape(*batch, terrains, 3),
-        contacts=flat.contacts.reshape(*batch, terrains, 4),
+        **{name: one.reshape((*batch, *axes)).to(device) for name, (one, axes) in values.items()}
     )
 
 
@@ -123,7 +108,6 @@ def rollout(
     commands: Float[Tensor, "n *#batch 3"],
     stiffness: Float[Tensor, " 3"],
     settings: StepSettings = DEFAULT_SETTINGS,
-    engine: Engine = "auto",
     previous: Float[Tensor, "*#batch 3"] | None = None,
     unusual: bool = False,
 ) -> list[Transition]:
@@ -136,9 +120,7 @@ def rollout(
     if commands.ndim < 2:
         raise ValueError(f"commands has shape {tuple(commands.shape)}, expected rows of 3 numbers")
     for command in commands:
-        transition = simulate_step(
-            scene, pose, command, stiffness, settings, engine, previous, unusual
-        )
+        transition = simulate_step(scene, pose, command, stiffness, settings, previous, unusual)
         transitions.append(transition)
         pose, previous = transition.pose, command
     return transitions
@@ -149,104 +131,116 @@ def needs_gradient(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
-def _use_native(engine: Engine, scene: ContactScene, given: tuple[Tensor, ...]) -> bool:
-    bodies = [body for body in scene.terrains if isinstance(body, HalfPlane)]
-    planes = [value for body in bodies for value in (body.direction, body.offset)]
-    inputs = (scene.points_ee, scene.friction, scene.compliance, *given, *planes)
-    possible = (
-        scene.friction.device.type == "cpu"
-        and len(bodies) == len(scene.terrains)
-        and not needs_gradient(*inputs)
-        and native.available()
-    )
-    if engine == "native" and not possible:
-        raise ValueError(
-            "engine 'native' needs numba, the CPU, half-plane terrains and no gradient; "
-            "use engine 'torch' or 'auto'"
-        )
-    return possible and engine != "torch"
-
-
-def _answer(
-    compiled: bool,
+def _flat(
     scene: ContactScene,
-    owner: Tensor,
+    batch: torch.Size,
     pose: Tensor,
     previous: Tensor | None,
     command: Tensor,
     stiffness: Tensor,
-    settings: StepSettings,
-) -> Transition:
-    """Step transitions whose scenes are all rigid, or all yield."""
-    if not compiled:
-        return _step_finite(
-            scene.gather(owner).double(), pose.double(), previous, command, stiffness, settings
+) -> Asked:
+    """What is asked with one batch axis, in float64 on the CPU; outlines and planes as they are in
+    the scene."""
+
+    def ready(value: Tensor, *axes: int) -> Tensor:
+        if value.device.type != "cpu":
+            _tell_once(value.device.type)
+        return value.reshape(-1, *axes).to("cpu", torch.float64)
+
+    def each(value: Tensor) -> Tensor:
+        return ready(value.expand(*batch, 3), 3)
+
+    terrains, outlines = len(scene.terrains), scene.points_ee.shape[:-2]
+    owner = torch.arange(scene.batch_shape.numel()).reshape(scene.batch_shape)
+    owner = owner.expand(batch).reshape(-1)
+    outline = torch.arange(outlines.numel()).reshape(outlines).expand(scene.batch_shape)
+    return Asked(
+        points=ready(scene.points_ee, *scene.points_ee.shape[-2:]),
+        normals=ready(torch.stack([body.direction for body in scene.terrains], -2), terrains, 2),
+        offsets=ready(torch.stack([body.offset for body in scene.terrains], -1), terrains),
+        friction=ready(scene.friction, terrains),
+        compliance=ready(scene.compliance, terrains),
+        start=each(pose),
+        previous=None if previous is None else each(previous),
+        command=each(command),
+        stiffness=each(stiffness) if stiffness.ndim > 1 else ready(stiffness, 3),
+        outline=outline.reshape(-1)[owner],
+        scene=owner,
+    )
+
+
+@cache
+def _tell_once(device: str) -> None:
+    warnings.warn(f"contact is solved on the CPU, not on {device}", stacklevel=4)
+
+
+def _part(asked: Asked, index: Tensor) -> Asked:
+    """Some of the transitions."""
+    each = ("start", "previous", "command", "outline", "scene")
+    each = (*each, "stiffness") if len(asked.stiffness) > 1 else each
+    values = {name: getattr(asked, name) for name in each}
+    return asked._replace(**{n: v if v is None else v[index] for n, v in values.items()})
+
+
+def _settle(asked: Asked, settings: StepSettings) -> Answered:
+    floating = [value for value in asked[:-2] if value is not None]
+    if needs_gradient(*floating):
+        return Answered(*_Settle.apply(settings, *asked))
+    return step(asked, settings)
+
+
+class _Settle(torch.autograd.Function):
+    """The compiled step; its derivatives are carried forward through the parts of the path, so that
+    the way back is a contraction. Only the pose is differentiable."""
+
+    @staticmethod
+    def forward(ctx: Any, settings: StepSettings, *inputs: Any) -> tuple[Tensor, ...]:
+        """Step, and keep the derivatives."""
+        asked = Asked(*inputs)
+        found = step(asked, settings, gradient=True)
+        ctx.mark_non_differentiable(*found[1:])
+        ctx.save_for_backward(
+            found.status, found.from_start, found.from_gap, found.from_inputs, found.from_points,
+            asked.normals, asked.outline, asked.scene,
+        )  # fmt: skip
+        ctx.sizes = (len(asked.points), len(asked.offsets), len(asked.stiffness))
+        return tuple(found)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_pose: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        """What a number answers to the inputs, from what it answers to the settled pose."""
+        status, from_start, from_gap, from_inputs, from_points, *places = ctx.saved_tensors
+        normals, outline, scene = places
+        outlines, scenes, shared = ctx.sizes
+        invalid = status == int(StepStatus.INVALID_INPUT)
+        by_pose = by_pose.masked_fill(invalid[:, None], 0.0)
+
+        def pulled(slopes: Tensor) -> Tensor:
+            slopes = slopes.masked_fill(invalid.reshape(-1, *[1] * (slopes.ndim - 1)), 0.0)
+            return (slopes * by_pose.reshape(-1, *[1] * (slopes.ndim - 2), 3)).sum(-1)
+
+        def gathered(values: Tensor, index: Tensor, count: int) -> Tensor:
+            return values.new_zeros(count, *values.shape[1:]).index_add_(0, index, values)
+
+        terrains = from_gap.shape[1]
+        sizes = (terrains, terrains, terrains, 3, 3, 3)
+        friction, compliance, angle, stiffness, previous, command = pulled(from_inputs).split(
+            sizes, -1
         )
-    shared = stiffness.reshape(-1, 3)
-    flat = native.step(scene, owner, pose, previous, command, shared, settings)
-    _relax_jammed(flat, scene, owner, pose, previous, command, stiffness, settings)
-    return flat
-
-
-def _relax_jammed(
-    flat: Transition,
-    scene: ContactScene,
-    owner: Tensor,
-    pose: Tensor,
-    previous: Tensor | None,
-    command: Tensor,
-    stiffness: Tensor,
-    settings: StepSettings,
-) -> None:
-    """Answer the elements that the compiled loops found jammed even without friction."""
-    jammed = torch.nonzero(flat.status == native.JAMMED).flatten()
-    if len(jammed) == 0:
-        return
-    before = None if previous is None else previous[jammed]
-    part = follow_path(
-        scene.gather(owner[jammed]),
-        pose[jammed],
-        before,
-        command[jammed],
-        own(stiffness, jammed),
-        settings,
-    )
-    for name in vars(part):
-        getattr(flat, name)[jammed] = getattr(part, name)
-
-
-def _step_finite(
-    scene: ContactScene,
-    start: Tensor,
-    previous: Tensor | None,
-    command: Tensor,
-    stiffness: Tensor,
-    settings: StepSettings,
-) -> Transition:
-    """Step what is finite and flag the rest, which then touches no gradient of the others."""
-    given = [start, command, scene.friction, *([] if previous is None else [previous])]
-    with torch.no_grad():
-        gaps, _ = lowest_points(scene, start, start.new_zeros(*scene.friction.shape, 1))
-        finite = torch.isfinite(gaps).flatten(1).all(-1)
-        finite = finite & torch.isfinite(scene.points_ee).flatten(1).all(-1)
-        for value in given:
-            finite = finite & torch.isfinite(value).all(-1)
-        finite = finite & ((scene.compliance >= 0) & (scene.compliance < torch.inf)).all(-1)
-        for body in scene.terrains:
-            if isinstance(body, HalfPlane):
-                finite = finite & ((body.direction.square().sum(-1) - 1).abs() <= OFF_UNIT)
-        finite = finite & ((scene.friction >= 0) & (scene.friction <= LARGEST_FRICTION)).all(-1)
-    if bool(finite.all()):
-        return follow_path(scene, start, previous, command, stiffness, settings)
-    index = torch.nonzero(finite).flatten()
-    before = None if previous is None else previous[index]
-    part = follow_path(
-        scene.gather(index), start[index], before, command[index], own(stiffness, index), settings
-    )
-    blank = {"mode": int(ContactMode.FREE), "status": int(StepStatus.INVALID_INPUT)}
-    whole = {}
-    for name, value in vars(part).items():
-        fill = blank.get(name, torch.inf if name == "residual" else torch.nan)
-        empty = value.new_full((len(start), *value.shape[1:]), fill)
-        whole[name] = empty.index_copy(0, index, value)
-    return Transition(**whole)
+        across = torch.stack((-normals[..., 1], normals[..., 0]), dim=-1)
+        given = ctx.needs_input_grad[1:]
+        return (
+            None,
+            gathered(pulled(from_points), outline, outlines) if given[0] else None,
+            gathered(angle, scene, scenes)[..., None] * across,
+            gathered(-pulled(from_gap), scene, scenes),
+            gathered(friction, scene, scenes),
+            gathered(compliance, scene, scenes),
+            pulled(from_start.mT),
+            previous if given[6] else None,
+            command,
+            stiffness.sum(0, keepdim=True) if shared == 1 else stiffness,
+            None,
+            None,
+        )

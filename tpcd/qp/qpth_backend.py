@@ -1,4 +1,4 @@
-"""The qpth engine: the interior point method of the optional package qpth, with care.
+"""The backend `qpth`: the interior point method of the optional package qpth, with care.
 
 B. Amos and J. Z. Kolter, "OptNet: Differentiable Optimization as a Layer in Neural
 Networks", ICML 2017. It is here to compare with and for users who have qpth elsewhere.
@@ -7,24 +7,24 @@ scaled to offsets of about 1; padding by far rows of unit length, since rows of 
 answers silently wrong; multipliers taken from the solver (its public function drops them);
 answers checked, since it reports no failures; and the inaccurate ones solved again without
 the others, since it stops for a whole batch at once (after which one in a thousand random
-contact problems is still short, by up to 0.15 N). For that reason, unlike in the other
-engines, neighbours do affect an element below `ACCURACY`.
+contact problems is still short, by up to 0.15 N). For that reason, unlike with
+`native`, neighbours do affect an element below `ACCURACY`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+from dataclasses import dataclass
 from importlib.util import find_spec
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.errors import SolverError
-from tpcd.qp.exact import ActiveSet
 from tpcd.qp.problem import ContactQP, QPSolution, Status
-from tpcd.qp.whitening import WhitenedQP, whiten
+from tpcd.qp.whitening import WhitenedQP, unwhiten, whiten
 
 FAR = 3.0
 """Offset of padded rows, in units of the problem's largest offset."""
@@ -38,16 +38,62 @@ STEPS = 20
 """qpth's own limit of steps in one round; it stops earlier when three brought nothing."""
 
 
-def solve_qpth(problem: WhitenedQP) -> ActiveSet:
+@dataclass(frozen=True)
+class ActiveSet:
+    """Where a solver ended, in whitened variables (batch last)."""
+
+    motion: Float[Tensor, "k b"]
+    """w."""
+    multipliers: Float[Tensor, "m b"]
+    """Of the unit rows; zero on inactive rows."""
+    active: Bool[Tensor, "m b"]
+    status: Int[Tensor, " b"]
+    iterations: Int[Tensor, " b"]
+
+
+def solve_qpth(problem: ContactQP) -> QPSolution:
+    """Solve a checked batch on its device; statuses, units and dtype as solve.py promises.
+
+    Raises SolverError where qpth is not installed.
+    """
+    if find_spec("qpth") is None:
+        told = "qpth is not installed: pip install 'tpcd[qpth]', or use the backend native"
+        raise SolverError(told)
+    whitened = whiten(problem)
+    return _assemble(problem, whitened, solve_whitened(whitened))
+
+
+def _assemble(problem: ContactQP, whitened: WhitenedQP, answer: ActiveSet) -> QPSolution:
+    """Back to the problem's variables, units, layout and dtype; statuses and residual."""
+    batch, dtype = problem.batch_shape, problem.target.dtype
+    n, m = problem.variables, problem.row_count
+    valid = whitened.valid
+    motion = unwhiten(whitened, answer.motion[:n])
+    nan = float("nan")
+    status = torch.where(valid, answer.status, int(Status.INVALID_INPUT))
+    answered = valid & (status != int(Status.INFEASIBLE))
+    active = answer.active & answered
+    multipliers = answer.multipliers / whitened.lengths
+    return QPSolution(
+        motion=motion.where(answered, nan).T.reshape(*batch, n).to(dtype),
+        multipliers=multipliers.where(answered, nan).T.reshape(*batch, m).to(dtype),
+        active=active.T.reshape(*batch, m),
+        residual=optimality_residual(whitened, answer)
+        .where(answered, nan)
+        .reshape(batch)
+        .to(dtype),
+        status=status.reshape(batch),
+        iterations=answer.iterations.reshape(batch),
+    )
+
+
+def solve_whitened(problem: WhitenedQP) -> ActiveSet:
     """Solve a batch of whitened problems by qpth.
 
     Rows count as active where their multiplier exceeds their slack. Statuses: SOLVED;
     INFEASIBLE where rows stay violated under growing multipliers; ITERATION_LIMIT where
     the answer is short of `ACCURACY`. `iterations` holds the limit of the rounds used.
-    Raises SolverError where qpth is not installed.
     """
-    if find_spec("qpth") is None:
-        raise SolverError("engine qpth is not installed: pip install 'tpcd[qpth]', or use exact")
     k, m, count = problem.rows.shape
     motion = problem.rows.new_zeros(k, count)
     force = torch.zeros_like(problem.offsets)
@@ -112,6 +158,22 @@ def independent_rows(problem: ContactQP, solution: QPSolution) -> Bool[Tensor, "
     if problem.compliance is not None:
         springs = springs | (problem.compliance > 0)
     return torch.where(springs, solution.active, chosen)
+
+
+def optimality_residual(problem: WhitenedQP, answer: ActiveSet) -> Float[Tensor, " b"]:
+    """Largest violation of the optimality conditions in whitened variables and unit rows.
+
+    Stationarity |w - rows^T u|, rows max(0, -slack), signs max(0, -u), complementarity
+    |u slack|; all but the last in the unit of w [sqrt(J)], the last in its square.
+    """
+    force = answer.multipliers
+    if problem.rows.shape[1] == 0:
+        return torch.zeros_like(problem.target[0])
+    slack = (problem.rows * answer.motion[:, None]).sum(0) + problem.offsets
+    pushed = (problem.rows * force).sum(1)
+    parts = (-slack, -force, (slack * force).abs(), (answer.motion - pushed).abs())
+    worst = torch.stack([part.amax(0) for part in parts]).amax(0)
+    return worst.clamp_min(0.0)
 
 
 def _residual(rows: Tensor, offsets: Tensor, motion: Tensor, force: Tensor) -> Tensor:

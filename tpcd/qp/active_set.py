@@ -1,8 +1,16 @@
-"""The dual active-set method for one element, compiled by numba, for compiled callers.
+"""The dual active-set method for one element, compiled, for compiled callers.
 
-Same method, tolerances and choices as exact.py, which has the mathematics; nothing is
-allocated inside. Import this module only where numba is installed. Any `numba.njit`
-function can call
+D. Goldfarb and A. Idnani, "A numerically stable dual method for solving strictly convex
+quadratic programs", Mathematical Programming 27 (1983), on whitened problems. From the
+unconstrained minimum w = 0, repeat: take the most violated row p, split its gradient g_p into a
+part in the span of the active rows, N^T r, and the rest z; move w along z and the multipliers
+along (-r, 1) until p holds (it joins the active rows) or a multiplier reaches zero (that row
+leaves, and p is tried again). If z = 0 and no multiplier shrinks, the rows contradict each other: a
+proof of infeasibility. The method ends after finitely many steps, since the objective grows with
+each. The active rows are kept with the dual basis D (D N^T = I), updated by rank-one terms; at most
+as many rows are active as there are variables, and only independent ones, so D never turns
+singular. Ties go to the lowest index. Nothing is allocated inside. Any `numba.njit` function can
+call
 
     status, steps = solve_whitened_3(
         rows, offsets, magnitudes, m, motion, multipliers, slots, work
@@ -31,11 +39,16 @@ from __future__ import annotations
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-from tpcd.qp.exact import DEPENDENCE_TOLERANCE, RATIO_TOLERANCE, VIOLATION_TOLERANCE
+from tpcd.loops import njit
 from tpcd.qp.problem import Status
 
+VIOLATION_TOLERANCE = 1e-13
+"""A row counts as violated beyond this times the size of the numbers it is the sum of."""
+DEPENDENCE_TOLERANCE = 1e-10
+"""A unit row whose rest outside the active span is shorter than this depends on them."""
+RATIO_TOLERANCE = 1e-11
+"""A multiplier that shrinks more slowly than this does not block; it is rounding."""
 _SOLVED = int(Status.SOLVED)
 _INFEASIBLE = int(Status.INFEASIBLE)
 _ITERATION_LIMIT = int(Status.ITERATION_LIMIT)

@@ -1,6 +1,8 @@
-"""One quasi-static transition in compiled loops: rest, flight to the first touch, settling, and
-the path of the command where contact changes or turns. The same model as `settle`, `flight` and
-`implicit`.
+"""One quasi-static transition: rest, flight to the first touch, settling, and the path of the
+command where contact changes or turns.
+
+Away from contact an impedance-controlled arm settles on its command, so the motion from a free
+start is the straight line from pose to command, and friction acts only from the first touch on.
 """
 
 from __future__ import annotations
@@ -10,29 +12,17 @@ from typing import no_type_check
 
 import numpy as np
 
-from tpcd.simulator.kernel_events import NOTHING, next_event, respond_until
-from tpcd.simulator.kernel_geometry import first_touch, touching
-from tpcd.simulator.kernel_inner import inner
-from tpcd.simulator.kernel_linear import linear_system
-from tpcd.simulator.kernel_request import sound, wrap
-from tpcd.simulator.kernel_rest import depth_inside, distance_from_rest
-from tpcd.simulator.kernel_settle import (
-    CONVERGED,
-    INVALID,
-    JAMMED,
-    NOT_CONVERGED,
-    RELAXED,
-    START_INSIDE,
-    settle,
-)
-from tpcd.simulator.kernel_slopes import (
-    append_part,
-    append_theta,
-    copy_rows,
-    landing_response,
-    settling_response,
-)
-from tpcd.simulator.kernel_walk import (
+from tpcd.loops import inner
+from tpcd.simulator.events import NOTHING, next_event, respond_until
+from tpcd.simulator.geometry import first_touch, touching
+from tpcd.simulator.path import (
+    AIM,
+    ALMOST,
+    GLANCE,
+    LOOK,
+    MOST_SOUGHT,
+    PASSED,
+    TRY,
     contact_modes,
     ends_alike,
     least_part,
@@ -42,21 +32,33 @@ from tpcd.simulator.kernel_walk import (
     shorter_part,
     sticking,
 )
-from tpcd.simulator.kernel_wedge import may_wedge
 from tpcd.simulator.record import REST_TOLERANCE, START_DEPTH
-from tpcd.simulator.walk import (
-    AIM,
-    ALMOST,
-    GLANCE,
-    LOOK,
-    MOST_SOUGHT,
-    PASSED,
-    TRY,
+from tpcd.simulator.request import sound, wrap
+from tpcd.simulator.residual import depth_inside, distance_from_rest
+from tpcd.simulator.response import linear_system
+from tpcd.simulator.rest import (
+    CONVERGED,
+    INVALID,
+    NOT_CONVERGED,
+    RELAXED,
+    START_INSIDE,
+    settle,
 )
-from tpcd.simulator.wedge import LIGHTER
+from tpcd.simulator.tangents import (
+    append_further,
+    append_part,
+    begin_further,
+    clear_further,
+    copy_rows,
+    follow_command,
+    further_rows,
+    landing_response,
+    settling_response,
+)
+from tpcd.simulator.wedging import LIGHTER, may_wedge
 
 PLAIN, LOOSE, SLIPPING, WEDGED, FRICTIONLESS = 0, 1, 2, 3, 4
-"""Attempts at settling (see `wedge`): as it is; what may be wedged or is jammed, without friction;
+"""Attempts at settling (see `wedging`): as it is; without friction what may be wedged or is jammed;
 from there with it again; if that is no better, as it is after all, or what jams without it."""
 
 RESTING, STRAIGHT, WALKING, STRAIGHT_AFTER_ALL = 0, 1, 2, 3
@@ -66,13 +68,11 @@ RESTING, STRAIGHT, WALKING, STRAIGHT_AFTER_ALL = 0, 1, 2, 3
 @inner(error_model="numpy", forceinline=True)
 @no_type_check
 def step_element(
-    world, o, chains, law, extent, request, b, answer, space, slopes, poses, by_theta, moved
+    world, o, chains, law, extent, request, b, answer, space, slopes, poses
 ):  # fmt: skip
     """One transition: rest on what was touched, go to the command, follow its path if need be.
 
-    `moved` is the element of `by_theta`.
-
-    Leaves the derivatives by theta, of a given start pose, in `slopes.theta`.
+    Leaves the derivatives by further inputs in `slopes.further`.
     """
     start, before, command, part = poses[0], poses[1], poses[2], poses[3]
     landing, pose, kept_pose = poses[4], poses[5], poses[6]
@@ -88,12 +88,13 @@ def step_element(
         answer.poses[b], answer.modes[b] = np.nan, 0
         answer.from_start[b], answer.from_gap[b] = np.nan, np.nan
         answer.from_lever[b], answer.contacts[b] = np.nan, np.nan
+        if answer.from_inputs.shape[1] > 0:
+            answer.from_inputs[b], answer.from_points[b] = np.nan, np.nan
         return
     before[2] = start[2] + wrap(before[2] - start[2])
     command[2] = start[2] + wrap(command[2] - start[2])
     whole[:] = 0.0
-    theta, entries = slopes.theta, slopes.theta.shape[0]
-    theta[:] = 0.0
+    begin_further(slopes)
     for a in range(3):
         pose[a] = start[a]
         whole[a, a] = 1.0
@@ -107,7 +108,7 @@ def step_element(
         space.load[:] = 0.0
         inside = depth_inside(world, o, chains, pose, space.load) > START_DEPTH
         modes = sticking(touching(world, o, chains, pose), terrains)
-        _keep(slopes, pose, kept_pose, height, entries)
+        _keep(slopes, pose, kept_pose, height)
     while True:
         share = 0.0 if stage == RESTING else 1.0
         if stage == WALKING:
@@ -117,7 +118,7 @@ def step_element(
             start[a] = pose[a]
         follows, ended, left, now = 1.0 - share if rested else 0.0, CONVERGED, 0.0, 0
         fraction, point, terrain = first_touch(world, o, chains, start, part)
-        relaxed, slid = False, False
+        relaxed, jammed, slid = False, False, False
         for a in range(3):
             landing[a] = start[a] + fraction * (part[a] - start[a])
             pose[a] = landing[a] if fraction < 1.0 else part[a]
@@ -125,8 +126,9 @@ def step_element(
             attempt, first, most = PLAIN, CONVERGED, np.inf
             while True:
                 ended, left = settle(
-                    world, o, chains, law, extent, landing, part, space, pose, attempt != SLIPPING
-                )
+                    world, o, chains, law, extent, landing, part, space, pose,
+                    attempt != SLIPPING, attempt == FRICTIONLESS,
+                )  # fmt: skip
                 load = 0.0
                 for j in range(len(space.room)):
                     load += space.multiplier[j]
@@ -145,9 +147,7 @@ def step_element(
                 attempt = following
             slid = space.slid[0]
             relaxed = attempt == FRICTIONLESS
-            if relaxed and ended == RELAXED:
-                status = JAMMED
-                break
+            jammed = relaxed and ended == RELAXED
             now = contact_modes(space, terrains)
         gone = share - done
         idle = stage != WALKING or request.finest == 1.0 or spent == MOST_SOUGHT
@@ -170,9 +170,10 @@ def step_element(
         if fraction == 1.0:
             for j in range(len(space.room)):
                 space.chosen[j, 0] = -1
-            whole[:], theta[:] = 0.0, 0.0
+            whole[:] = 0.0
             for a in range(3):
                 whole[a, a] = follows
+            follow_command(slopes, terrains, share, rested)
         else:
             status, residual = max(status, ended), max(residual, left)
             landing_response(world, o, start, part, fraction, point, terrain, slopes)
@@ -184,7 +185,7 @@ def step_element(
                 if off > REST_TOLERANCE * law.tolerance:
                     status = max(status, NOT_CONVERGED)
             settling_response(law, terrains, space, slopes)
-            if stage == WALKING and share < 1.0:
+            if stage == WALKING and share < 1.0 and not jammed:
                 ahead, event = next_event(
                     world, o, chains, law, before, command, pose, space, slopes.rate
                 )
@@ -193,11 +194,15 @@ def step_element(
                     respond_until(world, o, law, event, pose, space, slopes)
                 else:
                     event = NOTHING
-            append_part(slopes, follows, space.force, space.right)
-            touch = (point, terrain)
-            append_theta(
-                world, o, law, by_theta, moved, relaxed, touch, event, landing, pose, space, slopes
-            )
+            append_part(slopes, follows)
+            append_further(
+                world, o, law, relaxed, (point, terrain), event, landing, part, share, rested,
+                pose, space, slopes,
+            )  # fmt: skip
+            if jammed:
+                # What yields to everything has no derivative.
+                whole[:] = 0.0
+                clear_further(slopes)
             if event[0] >= 0:
                 share += ahead
                 for a in range(3):
@@ -209,7 +214,7 @@ def step_element(
             if fraction == 0.0:
                 inside = depth_inside(world, o, chains, landing, space.load) > START_DEPTH
             modes, status, residual, stage = now, CONVERGED, 0.0, STRAIGHT
-            _keep(slopes, pose, kept_pose, height, entries)
+            _keep(slopes, pose, kept_pose, height)
         elif stage == STRAIGHT:
             parts = parts_of_path(request, command[2] - before[2], modes, now, terrains, slid)
             if parts == 1:
@@ -217,7 +222,7 @@ def step_element(
             stage, straight, length = WALKING, status, 1.0 / parts
             if request.finest < 1.0 and not ends_alike(modes, now, terrains, slid):
                 seeks, kind, length = True, LOOK, GLANCE
-            _restore(slopes, pose, kept_pose, height, entries)
+            _restore(slopes, pose, kept_pose, height)
             status, residual = CONVERGED, 0.0
         elif stage == WALKING and share < 1.0:
             modes, done, moving = now, share, True
@@ -227,7 +232,7 @@ def step_element(
             kind, length = next_part(event[0] >= 0, seeks, ahead, longest)
         elif stage == WALKING and status > straight:
             stage, status, residual = STRAIGHT_AFTER_ALL, CONVERGED, 0.0
-            _restore(slopes, pose, kept_pose, height, entries)
+            _restore(slopes, pose, kept_pose, height)
         else:
             break
     if status == CONVERGED and inside:
@@ -243,6 +248,14 @@ def step_element(
     copy_rows(whole, 0, answer.from_start[b], 3)
     copy_rows(whole, 3, answer.from_gap[b], terrains)
     copy_rows(whole, 3 + terrains, answer.from_lever[b], terrains)
+    if answer.from_inputs.shape[1] > 0:
+        copy_rows(slopes.further, 0, answer.from_inputs[b], slopes.inputs)
+        answer.from_points[b] = 0.0
+        for i in range(slopes.count[0]):
+            for c in range(2):
+                for a in range(3):
+                    row = slopes.inputs + 2 * i + c
+                    answer.from_points[b, slopes.touched[i, 0], c, a] += slopes.further[row, a]
 
 
 @inner
@@ -262,20 +275,20 @@ def _after(attempt, first, ended, coulomb, lighter):
 
 @inner
 @no_type_check
-def _keep(slopes, pose, kept_pose, height, entries):
+def _keep(slopes, pose, kept_pose, height):
     """Keep the state that the path begins in."""
     copy_rows(slopes.whole, 0, slopes.kept, height)
-    copy_rows(slopes.theta, 0, slopes.theta_kept, entries)
+    copy_rows(slopes.further, 0, slopes.further_kept, further_rows(slopes))
     for a in range(3):
         kept_pose[a] = pose[a]
 
 
 @inner
 @no_type_check
-def _restore(slopes, pose, kept_pose, height, entries):
+def _restore(slopes, pose, kept_pose, height):
     """Go back to the state that the path begins in."""
     copy_rows(slopes.kept, 0, slopes.whole, height)
-    copy_rows(slopes.theta_kept, 0, slopes.theta, entries)
+    copy_rows(slopes.further_kept, 0, slopes.further, further_rows(slopes))
     for a in range(3):
         pose[a] = kept_pose[a]
 

@@ -1,8 +1,7 @@
-"""The native engine: the exact engine's method, one element after the other, by numba.
+"""The backend `native`: the active-set method over a batch, one element after the other.
 
-Whitening, the dual active-set loop (compiled.py), residual and units in one compiled pass
-over the batch; padded rows are skipped. A single thread that releases the interpreter
-lock. Import this module only where numba is installed.
+Whitening, the dual active-set loop (active_set.py), residual and units in one compiled pass
+over the batch; padded rows are skipped. A single thread that releases the interpreter lock.
 """
 
 from __future__ import annotations
@@ -11,11 +10,10 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from tpcd.errors import SolverError
-from tpcd.qp.compiled import solve_rows
+from tpcd.loops import njit
+from tpcd.qp.active_set import solve_rows
 from tpcd.qp.problem import ContactQP, QPSolution, Status
 from tpcd.qp.whitening import ASYMMETRY_TOLERANCE, PIVOT_TOLERANCE, shared_hessian
 
@@ -25,8 +23,6 @@ _INVALID = int(Status.INVALID_INPUT)
 
 def solve_native(problem: ContactQP, iteration_limit: int | None = None) -> QPSolution:
     """Solve a checked batch on the CPU; statuses, units and dtype as solve.py promises."""
-    if problem.target.device.type != "cpu":
-        raise SolverError(f"engine native runs on the CPU, not on {problem.target.device}")
     n, m, batch = problem.variables, problem.row_count, problem.batch_shape
     count = batch.numel()
     dtype = problem.target.dtype

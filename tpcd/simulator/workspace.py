@@ -8,7 +8,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from tpcd.simulator.kernel_inner import inner
+from tpcd.loops import inner
 
 LIST = 8
 """Candidate points kept for each terrain."""
@@ -45,6 +45,16 @@ class System(NamedTuple):
     violated: np.ndarray
     inverse: np.ndarray
     starts: np.ndarray
+
+
+class Elastic(NamedTuple):
+    """Room for a problem of w rows that give way: `rows` (w, k + w), `motion` (k + w), `slots` (w),
+    `work` (w + 5, k + w)."""
+
+    rows: np.ndarray
+    motion: np.ndarray
+    slots: np.ndarray
+    work: np.ndarray
 
 
 class Space(NamedTuple):
@@ -85,6 +95,7 @@ class Space(NamedTuple):
     gain: np.ndarray
     margins: np.ndarray
     friction: np.ndarray
+    elastic: Elastic
 
 
 @inner(_nrt=True)
@@ -127,4 +138,10 @@ def new_space(terrains, room):
         np.empty(k),
         np.empty(k),
         np.zeros(terrains),
+        Elastic(
+            np.empty((width, k + width)),
+            np.empty(k + width),
+            np.zeros(width, np.int64),
+            np.empty((width + 5, k + width)),
+        ),
     )

@@ -1,20 +1,37 @@
-"""Linear response of a rest pose in compiled loops, as in `implicit`: the rest equations of the
-rows that carry load, and how the pose answers a change of their right-hand sides.
+"""Linear response of a rest pose, by the implicit function theorem.
+
+At rest the pose x' and the multipliers of the loaded contact rows solve
+
+    K (x' - u) - B(x')^T lambda = 0,      c_j(x', start) = 0 for every loaded row j,            (2)
+
+where B holds the force directions n + s mu t of the contacts as wrenches, and c_j is the gap alone
+for a point that slips under Coulomb friction, or gap + s mu slip otherwise, and what the terrain
+yields. The pose answers a change of their right-hand sides by
+
+    dx = S (f + B^T dl),      (A S B^T + C) dl = r - A S f,      S = (K + turning)^-1,           (3)
+
+A being the rows' derivatives by the pose, C the compliance of rows on one terrain, and `turning`
+how the contact torques change as the outline turns.
 """
 
 from __future__ import annotations
 
 from typing import no_type_check
 
-from tpcd.simulator.implicit import DEPENDENT, SINGULAR
-from tpcd.simulator.kernel_geometry import object_normal
-from tpcd.simulator.kernel_inner import inner
+from tpcd.loops import inner
+from tpcd.simulator.geometry import object_normal
+
+SINGULAR = 1e-9
+"""Determinant over the product of the row sums below which loaded rows count as dependent."""
+DEPENDENT = 1e-12
+"""Pivot over the largest row sum below which they do where terrains yield: little compliance makes
+rows nearly dependent."""
 
 
 @inner(error_model="numpy", forceinline=True)
 @no_type_check
 def linear_system(world, o, law, command, pose, turn, space):
-    """Residuals and matrices of the rest equations at `pose`, as in `implicit`.
+    """Residuals and matrices of the rest equations (2) at `pose`.
 
     Fills `system`; False where the complement is singular.
     """
@@ -132,7 +149,7 @@ def _invert(matrix, other):
 @inner
 @no_type_check
 def respond(space):
-    """Pose change for the right-hand sides `force` of the balance and `right` of the rows.
+    """Pose change (3) for the right-hand sides `force` of the balance and `right` of the rows.
 
     Leaves it in `change`, and the change of the multipliers in `gain`; `system` must be filled.
     """

@@ -1,4 +1,4 @@
-"""Compiled geometry of the quasi-static step: which outline point is lowest over a half-plane.
+"""Geometry of the quasi-static step: which outline point is lowest over a half-plane.
 
 A half-plane touches an outline only at its hull, and over the few angles that the steps of
 one scene pass through only at a short piece of it. `build_chains` finds that piece once for
@@ -17,10 +17,10 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from tpcd.simulator.kernel_inner import inner
+from tpcd.loops import inner
 
 FREE_GAP = 1e-5
-"""A start pose flies when every gap exceeds this [m]; as in `flight`."""
+"""A start pose flies when every gap exceeds this [m]."""
 TOUCH_ROUNDS = 20
 """Cap on the points that the search for the first touch may try; it mostly needs two."""
 WIDEST = 1.2

@@ -1,4 +1,4 @@
-"""What the compiled step is asked and where its answers go; planes, law and chains of a scene."""
+"""What the step is asked and where its answers go; planes, law and chains of a scene."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
+from tpcd.loops import inner
 from tpcd.parameters import LARGEST_FRICTION
-from tpcd.simulator.kernel_geometry import build_chains
-from tpcd.simulator.kernel_inner import inner
-from tpcd.simulator.kernel_space import Law
-from tpcd.simulator.settle import PROBE_ANGLE
+from tpcd.simulator.geometry import build_chains
+from tpcd.simulator.rest import PROBE_ANGLE
+from tpcd.simulator.workspace import Law
 from tpcd.terrain import OFF_UNIT
 
 
@@ -40,7 +40,8 @@ class Answer(NamedTuple):
     """Where the answers go; the fields of `Transition` but the wrench.
 
     `contacts` (b, t, 4) are normal and tangential force, and the arm of the contact point from
-    the end effector in world axes.
+    the end effector in world axes. Derivatives by further inputs (see `Slopes.further`) are
+    `from_inputs` (b, i, 3) and `from_points` (b, p, 2, 3), without entries where none are asked.
     """
 
     poses: np.ndarray
@@ -51,6 +52,8 @@ class Answer(NamedTuple):
     from_gap: np.ndarray
     from_lever: np.ndarray
     contacts: np.ndarray
+    from_inputs: np.ndarray
+    from_points: np.ndarray
 
 
 @inner(_nrt=True)

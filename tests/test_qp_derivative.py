@@ -37,15 +37,14 @@ def check(function, *inputs: torch.Tensor, twice: bool = True) -> None:
         assert gradgradcheck(function, leaves, eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("engine", ["auto", "native"])
 @pytest.mark.parametrize("soft", [False, True], ids=["rigid", "compliant"])
-def test_gradients_are_exact_in_every_input(engine, soft):
+def test_gradients_are_exact_in_every_input(soft):
     problem = generic(2, 4, 0)
     assert solve(problem).active.any(-1).all()
 
     def answer(hessian, target, rows, offsets, compliance):
         springs = compliance if soft else None
-        solution = solve(ContactQP(hessian, target, rows, offsets, springs), engine)
+        solution = solve(ContactQP(hessian, target, rows, offsets, springs))
         return solution.motion, solution.multipliers
 
     check(answer, *problem.tensors)
@@ -139,8 +138,7 @@ def test_padded_rows_get_zero_gradient_and_change_none():
     assert not (gradients[0][2][~problem.row_mask] != 0).any()
 
 
-@pytest.mark.parametrize("engine", ["auto", "native"])
-def test_gradients_are_exact_beside_padded_rows(engine):
+def test_gradients_are_exact_beside_padded_rows():
     """To second order too; each element has another number of rows, at other places."""
     problem = generic(2, 6, 3)
     mask = torch.tensor(
@@ -149,7 +147,7 @@ def test_gradients_are_exact_beside_padded_rows(engine):
     assert solve(replace(problem, row_mask=mask)).active.any(-1).all()
 
     def answer(hessian, target, rows, offsets, compliance):
-        solution = solve(ContactQP(hessian, target, rows, offsets, compliance, mask), engine)
+        solution = solve(ContactQP(hessian, target, rows, offsets, compliance, mask))
         return solution.motion, solution.multipliers
 
     check(answer, *problem.tensors[:5])
@@ -186,13 +184,13 @@ def test_gradients_of_the_elastic_fallback_are_exact():
 
 def test_asking_for_gradients_does_not_change_the_answer():
     problem = random_contact_problems(200, 12, 8, MIXED)
-    plain = solve(problem, "exact")
+    plain = solve(problem)
     traced = solve(replace(problem, target=problem.target.clone().requires_grad_()))
     assert traced.motion.requires_grad and traced.multipliers.requires_grad
     assert torch.equal(plain.motion, traced.motion.detach())
     assert torch.equal(plain.multipliers, traced.multipliers.detach())
     with torch.no_grad():
-        silent = solve(replace(problem, target=problem.target.clone().requires_grad_()), "exact")
+        silent = solve(replace(problem, target=problem.target.clone().requires_grad_()))
     assert not silent.motion.requires_grad
 
 

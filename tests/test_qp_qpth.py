@@ -1,4 +1,4 @@
-"""The optional engine qpth: same call, same statuses, less accuracy, none of it silent."""
+"""The optional backend qpth: same call, same statuses, less accuracy, none of it silent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytest.importorskip("qpth", reason="the extra qpth is not installed")
 
 def test_solved_elements_are_close_to_the_exact_answer():
     problem = random_contact_problems(1500, 8, 0)
-    answer, exact = solve(problem, "qpth"), solve(problem, "exact")
+    answer, exact = solve(problem, "qpth"), solve(problem)
     assert answer.solved.double().mean() > 0.99
     force = (answer.motion - exact.motion) @ problem.hessian
     assert force[answer.solved].abs().max() < 0.02
@@ -42,7 +42,7 @@ def test_duplicates_and_padding_are_not_silently_wrong():
         problem.offsets.repeat(1, 2),
         row_mask=problem.row_mask.repeat(1, 2),
     )
-    answer, exact = solve(twice, "qpth"), solve(problem, "exact")
+    answer, exact = solve(twice, "qpth"), solve(problem)
     force = (answer.motion - exact.motion) @ problem.hessian
     assert force[answer.solved].abs().max() < 0.02
 
@@ -50,7 +50,7 @@ def test_duplicates_and_padding_are_not_silently_wrong():
 def test_jammed_problems_are_never_reported_as_solved():
     jamming = ContactRecipe(friction=(1.1, 1.6), gaps=(-0.003, 0.001), wall_share=0.5)
     problem = random_contact_problems(400, 8, 3, jamming)
-    jammed = solve(problem, "exact").status == Status.RELAXED
+    jammed = solve(problem).status == Status.RELAXED
     answer = solve(problem, "qpth")
     assert jammed.any() and not (answer.solved & jammed).any()
 
@@ -72,7 +72,7 @@ def test_every_batch_shape_is_answered_in_kind(batch, m):
     problem = ContactQP(torch.eye(3, dtype=torch.float64), target, rows, rows[..., 0].abs())
     answer = solve(problem, "qpth")
     assert answer.motion.shape == (*batch, 3) and answer.multipliers.shape == (*batch, m)
-    expected = solve(problem, "exact").motion
+    expected = solve(problem).motion
     torch.testing.assert_close(answer.motion, expected, rtol=0, atol=1e-4)
     leaf = target.clone().requires_grad_()
     assert (
@@ -82,7 +82,7 @@ def test_every_batch_shape_is_answered_in_kind(batch, m):
     )
 
 
-def gradients(problem: ContactQP, engine: str) -> tuple[torch.Tensor, ...]:
+def gradients(problem: ContactQP, backend: str) -> tuple[torch.Tensor, ...]:
     """Of a weighted motion and resultant, in what all rows share: the share of each of redundant
     rows is not unique, neither in force nor in gradient."""
     eye = torch.eye(3, dtype=torch.float64)
@@ -95,7 +95,7 @@ def gradients(problem: ContactQP, engine: str) -> tuple[torch.Tensor, ...]:
         rows=problem.rows @ turn,
         offsets=problem.offsets + lift,
     )
-    solution = solve(moved, engine)
+    solution = solve(moved, backend)
     pushed = (moved.rows * solution.multipliers[..., None]).sum(-2)
     weights = torch.tensor([1.0, -2.0, 0.3], dtype=torch.float64)
     total = (solution.motion * weights).sum() + 1e-4 * (pushed * weights).square().sum()
@@ -103,9 +103,9 @@ def gradients(problem: ContactQP, engine: str) -> tuple[torch.Tensor, ...]:
 
 
 @pytest.mark.parametrize("copies", [1, 2])
-def test_gradients_are_those_of_the_exact_engine(copies: int) -> None:
+def test_gradients_are_those_of_the_exact_answer(copies: int) -> None:
     problem = random_contact_problems(300, 8, 5)
-    exact, other = solve(problem, "exact"), solve(problem, "qpth")
+    exact, other = solve(problem), solve(problem, "qpth")
     # Where qpth is accurate, and no row is touched without force.
     same = ((exact.multipliers > 1e-6) == exact.active).all(-1)
     force = ((other.motion - exact.motion) @ problem.hessian).abs().amax(-1)
@@ -118,7 +118,7 @@ def test_gradients_are_those_of_the_exact_engine(copies: int) -> None:
         offsets=problem.offsets.repeat(1, copies),
         row_mask=problem.row_mask.repeat(1, copies),
     )
-    for mine, theirs in zip(gradients(more, "qpth"), gradients(problem, "exact"), strict=True):
+    for mine, theirs in zip(gradients(more, "qpth"), gradients(problem, "native"), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-6)
 
 
@@ -126,14 +126,14 @@ def test_gradients_of_stiff_springs_keep_every_row() -> None:
     jamming = ContactRecipe(friction=(1.1, 1.6), gaps=(-0.003, 0.001), wall_share=0.5)
     problem = random_contact_problems(200, 8, 3, jamming)
     soft = replace(problem, compliance=torch.full_like(problem.offsets, 1e-8))
-    exact, other = solve(soft, "exact"), solve(soft, "qpth")
+    exact, other = solve(soft), solve(soft, "qpth")
     force = ((other.motion - exact.motion) @ problem.hessian).abs().amax(-1)
     same = (exact.active == other.active).all(-1) & exact.solved & other.solved
     soft = select(soft, same & (force < 1e-6))
     assert soft.batch_shape[0] > 50
     found = []
-    for engine in ("exact", "qpth"):
+    for backend in ("native", "qpth"):
         leaf = soft.target.clone().requires_grad_()
-        motion = solve(replace(soft, target=leaf), engine).motion
+        motion = solve(replace(soft, target=leaf), backend).motion
         found.append(torch.autograd.grad(motion.sum(), leaf)[0])
     torch.testing.assert_close(found[1], found[0], rtol=1e-4, atol=1e-6)

@@ -1,4 +1,4 @@
-"""The two engines of the step against each other; shapes, isolation, what elements report."""
+"""The step over a batch: shapes, isolation, what elements report."""
 
 from __future__ import annotations
 
@@ -22,77 +22,28 @@ from tpcd.contact import ContactScene, terrain_gaps
 from tpcd.planar import transform_points
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
 
-ENGINES = pytest.mark.parametrize("engine", ["torch", "native"])
 ANSWERS = ("pose", "wrench", "mode", "status", "pose_from_start", "pose_from_gap")
-SEVERAL_ANSWERS = 0.005
-"""Share of random transitions that may end in another state of rest: Coulomb friction with
-floor and wall has several, and an engine's search decides for one."""
-NOT_SETTLED = 0.02
-"""Share that may use up the rounds of the fixed point, with status NOT_CONVERGED."""
-
-
-def both(scene, start, command, settings, previous=None):
-    return tuple(
-        simulate_step(scene, start, command, STIFFNESS, settings, engine=e, previous=previous)
-        for e in ("native", "torch")
-    )
-
-
-@pytest.mark.parametrize(
-    ("law", "substeps", "count"), [("coulomb", 1, 200), ("anitescu", 1, 200), ("coulomb", 4, 40)]
-)
-def test_both_engines_give_the_same_answer(law, substeps, count):
-    scene, start, command = many_random_transitions(count, seed=61)
-    native, reference = both(
-        scene, start, command, StepSettings(friction=law, substeps=substeps, follow_path=True)
-    )
-    settled = (native.status == StepStatus.CONVERGED) & (reference.status == StepStatus.CONVERGED)
-    assert float((~settled).double().mean()) <= (NOT_SETTLED if law == "coulomb" else 0) * substeps
-    near = (native.pose - reference.pose).abs().amax(-1) < 1e-6
-    allowed = SEVERAL_ANSWERS if law == "coulomb" else 0.002
-    assert float((~near & settled).double().mean()) <= allowed * substeps
-    same = near & settled
-    assert (native.mode == reference.mode).all(-1)[same].double().mean() > 0.995
-    torch.testing.assert_close(native.wrench[same], reference.wrench[same], atol=1e-4, rtol=0)
-
-
-def test_both_engines_rest_alike_under_the_previous_command():
-    scene, start, first = many_random_transitions(40, seed=62)
-    settings = StepSettings()
-    rest = simulate_step(scene, start, first, STIFFNESS, settings, engine="native")
-    second = first + vector(0.004, -0.003, 0.01)
-    native, reference = both(scene, rest.pose, second, settings, previous=first)
-    settled = (native.status == StepStatus.CONVERGED) & (reference.status == StepStatus.CONVERGED)
-    near = (native.pose - reference.pose).abs().amax(-1) < 1e-6
-    assert float((near & settled).double().mean()) > 0.96
 
 
 def turns_in_contact(settings):
-    """Both engines on turns of 0.24 rad from rest in contact, and on the same in one part."""
+    """Turns of 0.24 rad from rest in contact, and the same in one part."""
     scene, start, first = many_random_transitions(40, seed=64)
-    rest = simulate_step(scene, start, first, STIFFNESS, engine="native")
+    rest = simulate_step(scene, start, first, STIFFNESS)
     turned = first + vector(0, 0, 0.24) * -first[:, 2:].sign()
-    given = (scene, rest.pose, turned)
-    whole = both(*given, replace(settings, substeps=1), previous=first)
-    return both(*given, settings, previous=first), whole
-
-
-def test_both_engines_cut_turns_alike():
-    (native, reference), _ = turns_in_contact(StepSettings())
-    settled = (native.status == StepStatus.CONVERGED) & (reference.status == StepStatus.CONVERGED)
-    near = (native.pose - reference.pose).abs().amax(-1) < 1e-6
-    assert float((near & settled).double().mean()) > 0.96
+    given = (scene, rest.pose, turned, STIFFNESS)
+    whole = simulate_step(*given, replace(settings, substeps=1), previous=first)
+    return simulate_step(*given, settings, previous=first), whole
 
 
 def test_where_the_parts_end_worse_the_whole_is_the_answer():
     """With so few rounds many parts do not settle."""
-    for found, whole in zip(*turns_in_contact(StepSettings(rounds=3)), strict=True):
-        assert (found.status <= whole.status).all()
-        parted = (found.pose != whole.pose).any(-1)
-        worse = ~parted & (whole.status == StepStatus.CONVERGED)
-        assert float(worse.double().mean()) > 0.02 and float(parted.double().mean()) > 0.3
-        for name in ANSWERS:
-            torch.testing.assert_close(getattr(found, name)[worse], getattr(whole, name)[worse])
+    found, whole = turns_in_contact(StepSettings(rounds=3))
+    assert (found.status <= whole.status).all()
+    parted = (found.pose != whole.pose).any(-1)
+    worse = ~parted & (whole.status == StepStatus.CONVERGED)
+    assert float(worse.double().mean()) > 0.02 and float(parted.double().mean()) > 0.3
+    for name in ANSWERS:
+        torch.testing.assert_close(getattr(found, name)[worse], getattr(whole, name)[worse])
 
 
 def test_resting_under_the_same_command_moves_nothing():
@@ -104,12 +55,11 @@ def test_resting_under_the_same_command_moves_nothing():
     assert float((moved < 1e-5)[converged].double().mean()) > 0.99
 
 
-@ENGINES
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3), (1,), (0,), (2, 0)])
-def test_answers_have_the_shape_of_the_batch(engine, shape):
+def test_answers_have_the_shape_of_the_batch(shape):
     scene = make_scene(friction=torch.full(shape, 0.4))
     start = vector(0, 0.06, 0).expand(*shape, 3)
-    result = simulate_step(scene, start, start, STIFFNESS, engine=engine)
+    result = simulate_step(scene, start, start, STIFFNESS)
     assert result.pose.shape == (*shape, 3) and result.wrench.shape == (*shape, 3)
     assert result.mode.shape == (*shape, 2) and result.status.shape == shape
     assert result.residual.shape == shape
@@ -117,8 +67,7 @@ def test_answers_have_the_shape_of_the_batch(engine, shape):
     assert result.pose_from_gap.shape == (*shape, 2, 3) == result.pose_from_lever.shape
 
 
-@ENGINES
-def test_scenes_and_transitions_broadcast(engine):
+def test_scenes_and_transitions_broadcast():
     scene, start, command = random_transitions(outline_points("mug"), 4, seed=64)
     column = make_scene(
         scene.points_ee[:, None],
@@ -126,18 +75,15 @@ def test_scenes_and_transitions_broadcast(engine):
         scene_floor(scene)[:, None],
         scene_wall(scene)[:, None],
     )
-    grid = simulate_step(column, start[:3], command[:3], STIFFNESS, engine=engine)
+    grid = simulate_step(column, start[:3], command[:3], STIFFNESS)
     assert grid.pose.shape == (4, 3, 3)
     for i in range(4):
         for j in range(3):
-            one = simulate_step(
-                scene.gather(torch.tensor([i])), start[j], command[j], STIFFNESS, engine=engine
-            )
+            one = simulate_step(scene.gather(torch.tensor([i])), start[j], command[j], STIFFNESS)
             torch.testing.assert_close(grid.pose[i, j], one.pose[0], atol=1e-12, rtol=0)
 
 
-@ENGINES
-def test_inputs_in_float32_are_solved_in_float64(engine):
+def test_inputs_in_float32_are_solved_in_float64():
     scene = make_scene()
     narrow = ContactScene(
         scene.points_ee.float(),
@@ -145,7 +91,7 @@ def test_inputs_in_float32_are_solved_in_float64(engine):
         scene.friction.float(),
     )
     result = simulate_step(
-        narrow, vector(0, 0.06, 0).float(), vector(0, 0.02, 0).float(), STIFFNESS, engine=engine
+        narrow, vector(0, 0.06, 0).float(), vector(0, 0.02, 0).float(), STIFFNESS
     )
     assert result.pose.dtype == torch.float64
     assert abs(float(result.pose[1]) - 0.05) < 1e-8
@@ -181,18 +127,15 @@ def broken_batch(what: str):
 BROKEN = ["point", "infinite point", "friction", "floor", "wall", "start", "command", "jam"]
 
 
-@ENGINES
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_element_is_flagged_and_changes_no_other(engine, what):
-    sound = simulate_step(*broken_batch("nothing"), STIFFNESS, engine=engine)
+def test_a_broken_element_is_flagged_and_changes_no_other(what):
+    sound = simulate_step(*broken_batch("nothing"), STIFFNESS)
     scene, *transition = broken_batch(what)
-    result = simulate_step(scene, *transition, STIFFNESS, engine=engine)
+    result = simulate_step(scene, *transition, STIFFNESS)
     others = torch.tensor([0, 1, 3, 4])
     for name in ANSWERS:
         expected, found = getattr(sound, name)[others], getattr(result, name)[others]
-        # Batched products of torch may round otherwise when a neighbour is left out.
-        atol = 0.0 if engine == "native" else 1e-12
-        torch.testing.assert_close(found, expected, atol=atol, rtol=0)
+        assert torch.equal(found, expected)
     if what == "jam":
         # Pushed out of both terrains, with friction, and told.
         assert int(result.status[2]) == StepStatus.START_INSIDE

@@ -1,13 +1,19 @@
-"""How far an answer is from rest, and a start pose inside a terrain, in compiled loops; as in
-`rest`."""
+"""How far an answer is from rest, whatever found it, and whether a start pose can have been one.
+
+At rest the object is inside no terrain, bears the load of what it touches alone, and the wrench
+K (x' - u) is the sum of the contact forces. How far an answer is from that is told as a length:
+what the forces do not balance by the way that the arm would still go for it, turns by the way of
+the furthest point of the outline. The arm knows angles to half a turn: where the object is turned
+further from its command, the spring pulls another way, and nothing rests.
+"""
 
 from __future__ import annotations
 
 import math
 from typing import no_type_check
 
-from tpcd.simulator.kernel_geometry import lowest_point, object_normal
-from tpcd.simulator.kernel_inner import inner
+from tpcd.loops import inner
+from tpcd.simulator.geometry import lowest_point, object_normal
 
 
 @inner

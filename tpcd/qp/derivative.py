@@ -5,9 +5,9 @@ system: with the active rows A, in whitened variables (H = L L^T, G = A L^-T),
 
     w = G^T lambda,    G w + compliance * lambda = -(A target + b),    v = target + L^-T w.
 
-The engine finds the active rows without autograd; this file solves that system again with
+The solver finds the active rows without autograd; this file solves that system again with
 autograd on. Where the active rows change (a row is touched without force) the answer has
-a kink and the derivative is the one of the engine's active set. Of duplicate rows only one
+a kink and the derivative is the one of the solver's active set. Of duplicate rows only one
 is active; the derivative of the sum of their forces, and of the motion, is right as long
 as the duplicates move together.
 """
@@ -31,7 +31,7 @@ def attach_gradients(
 
     `active` are its active rows, linearly independent where no compliance makes them so.
 
-    The values stay those of the engine, bit for bit. Elements without an answer
+    The values stay those of the solver, bit for bit. Elements without an answer
     (INVALID_INPUT, INFEASIBLE) get zero gradients, and so do inactive and padded rows.
     """
     relaxed = solution.status == int(Status.RELAXED)

@@ -1,15 +1,18 @@
-"""The filter over a history in plain torch, and what any engine answers."""
+"""The filter over a history in plain torch: the oracle of the compiled one.
+
+The formulas are those of `tpcd.belief.filter`; only the contact step is shared.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.belief.kalman import FAR, PASSES, Innovation, assimilate, first_state, parted
+from tpcd.belief.filter import FAR, OUTLIER_SQUARE, PASSES, HistoryLikelihood, Steps
 from tpcd.belief.misfit import MisfitField, misfit_rows
 from tpcd.belief.setting import Setting
 from tpcd.contact import ContactScene
@@ -19,52 +22,89 @@ from tpcd.simulator import ContactMode, StepSettings, StepStatus, simulate_step
 
 
 @dataclass(frozen=True)
-class Steps:
-    """How the n transitions of m particles settled; NaN (mode: zero) where one was
-    not stepped."""
+class FieldState:
+    """Normal belief over s = c + 3 numbers, the misfit coefficients and the error of the last
+    pose, m particles."""
 
-    pose: Float[Tensor, "m n 3"]
-    mode: Int[Tensor, "m n t"]
-    contacts: Float[Tensor, "m n t 4"]
-    """As in `Transition`."""
+    mean: Float[Tensor, "m s"]
+    covariance: Float[Tensor, "m s s"]
 
 
 @dataclass(frozen=True)
-class HistoryLikelihood:
-    """What theta says about a history, m particles.
+class Innovation:
+    """What a transition brings that was not known before, in independent standard units."""
 
-    `total` is the log likelihood, -inf for a particle that was given up; `field_mean` and
-    `field_covariance` are the normal posterior of the misfit coefficients. Where they are asked
-    for, `whitened` and `log_scale` are the innovations of the n transitions (see
-    `kalman.Innovation`), NaN without one, and `slopes` the derivatives of `whitened` by d
-    coordinates; `steps` how the transitions settled.
-    """
+    whitened: Float[Tensor, "m 3"]
+    log_scale: Float[Tensor, "m 3"]
+    """Logarithm of the units [log m, log m, log rad]."""
 
-    total: Float[Tensor, " m"]
-    field_mean: Float[Tensor, "m c"]
-    field_covariance: Float[Tensor, "m c c"]
-    whitened: Float[Tensor, "m n 3"] | None = None
-    log_scale: Float[Tensor, "m n 3"] | None = None
-    slopes: Float[Tensor, "m d n 3"] | None = None
-    steps: Steps | None = None
+    @property
+    def explained(self) -> Bool[Tensor, " m"]:
+        """Whether it lies within `OUTLIER_SQUARE`."""
+        return (self.whitened**2).sum(-1) < OUTLIER_SQUARE * (1 - 1e-9)
 
-    def __getitem__(self, index: Tensor | slice) -> HistoryLikelihood:
-        """Of some particles, without how their transitions settled."""
-        values = {name: v[index] for name, v in vars(self).items() if isinstance(v, Tensor)}
-        return replace(self, **values, steps=None)
+    @property
+    def log_density(self) -> Float[Tensor, " m"]:
+        """Log density of the transition's residual given those before."""
+        each = 0.5 * self.whitened**2 + self.log_scale + 0.5 * math.log(2 * math.pi)
+        return -each.sum(-1)
 
 
-def joined(parts: Sequence[HistoryLikelihood]) -> HistoryLikelihood:
-    """What is said of some particles after another, all asked the same."""
-    whole = {}
-    for name, first in vars(parts[0]).items():
-        values = [getattr(part, name) for part in parts]
-        if isinstance(first, Steps):
-            ways = zip(*(vars(value).values() for value in values), strict=True)
-            whole[name] = Steps(*(torch.cat(way) for way in ways))
-        else:
-            whole[name] = None if first is None else torch.cat(values)
-    return HistoryLikelihood(**whole)
+def first_state(
+    sd: Float[Tensor, " m"], coefficients: int, variance: Float[Tensor, "*each 3"]
+) -> FieldState:
+    """Before any transition: coefficients of standard deviation sd, first pose of `variance`."""
+    field = (sd**2)[:, None].expand(-1, coefficients)
+    diagonal = torch.cat((field, variance.expand(len(sd), 3)), dim=-1)
+    return FieldState(torch.zeros_like(diagonal), torch.diag_embed(diagonal))
+
+
+def parted(state: FieldState, count: int, variance: Float[Tensor, "*each 3"]) -> FieldState:
+    """The state past a transition that does not count: of the pose only its reading is known."""
+    mean, covariance = state.mean.clone(), torch.zeros_like(state.covariance)
+    mean[:, count:] = 0.0
+    covariance[:, :count, :count] = state.covariance[:, :count, :count]
+    covariance[:, count:, count:] = torch.diag_embed(variance)
+    return FieldState(mean, covariance)
+
+
+def assimilate(
+    state: FieldState,
+    residual: Float[Tensor, "m 3"],
+    rows: Float[Tensor, "m 3 c"],
+    from_start: Float[Tensor, "m 3 3"],
+    variance: Float[Tensor, "*each 3"],
+    uncovered: Float[Tensor, "m 3 3"],
+) -> tuple[FieldState, Innovation]:
+    """The state after a transition that started at the filtered pose, and its innovation."""
+    count = rows.shape[-1]
+    design = torch.cat((rows, -from_start), dim=-1)
+    cross = state.covariance @ design.mT
+    noise = torch.diag_embed(variance)
+    covariance = design @ cross + noise + uncovered
+    innovation = residual - (rows @ state.mean[:, :count, None])[..., 0]
+    factor, whitened = _whiten(covariance, innovation)
+    square = (whitened**2).sum(-1)
+    growth = (square / OUTLIER_SQUARE).clamp_min(1.0)
+    # Growing the covariance by a number stretches its factor by the root.
+    factor, whitened = factor * growth.sqrt()[:, None, None], whitened / growth.sqrt()[:, None]
+    found = Innovation(whitened, factor.diagonal(dim1=-2, dim2=-1).log())
+    # The next state: the field goes on, the error of this pose takes the place of the last.
+    answer = torch.cat((cross[:, :count], noise.expand_as(covariance)), dim=1)
+    gain = torch.linalg.solve_triangular(factor, answer.mT, upper=False).mT
+    keep = torch.cat((state.mean[:, :count], torch.zeros_like(innovation)), dim=-1)
+    before = torch.zeros_like(state.covariance)
+    before[:, :count, :count] = state.covariance[:, :count, :count]
+    before[:, count:, count:] = noise
+    mean = keep + (gain @ whitened[..., None])[..., 0]
+    return FieldState(mean, before - gain @ gain.mT), found
+
+
+def _whiten(covariance: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
+    """Cholesky factor L of each covariance, and L^-1 vector."""
+    factor = torch.linalg.cholesky(covariance)
+    whitened = torch.linalg.solve_triangular(factor, vector[..., None], upper=False)
+    return factor, whitened[..., 0]
 
 
 def filter_history(

@@ -1,0 +1,114 @@
+"""The quasi-static step as tensors in, tensors out: a flat batch through the compiled loops."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tpcd.simulator.record import DEGREES, StepSettings
+from tpcd.threads import in_parts
+
+if TYPE_CHECKING:
+    from tpcd.simulator.workspace import Law
+
+
+class Asked(NamedTuple):
+    """A flat batch of b transitions in float64 on the CPU, as `simulate_step` makes it."""
+
+    points: Float[Tensor, "o p 2"]
+    normals: Float[Tensor, "s t 2"]
+    offsets: Float[Tensor, "s t"]
+    friction: Float[Tensor, "s t"]
+    compliance: Float[Tensor, "s t"]
+    start: Float[Tensor, "b 3"]
+    previous: Float[Tensor, "b 3"] | None
+    command: Float[Tensor, "b 3"]
+    stiffness: Float[Tensor, "#b 3"]
+    outline: Int[Tensor, " b"]
+    """Whose points each transition has."""
+    scene: Int[Tensor, " b"]
+    """Whose planes, friction and compliance; all of these scenes are rigid, or all have terrain
+    that yields."""
+
+
+class Answered(NamedTuple):
+    """What the compiled loops answer; `pose` goes the short way round from the start."""
+
+    pose: Float[Tensor, "b 3"]
+    mode: Int[Tensor, "b t"]
+    status: Int[Tensor, " b"]
+    residual: Float[Tensor, " b"]
+    from_start: Float[Tensor, "b 3 3"]
+    from_gap: Float[Tensor, "b t 3"]
+    from_lever: Float[Tensor, "b t 3"]
+    contacts: Float[Tensor, "b t 4"]
+    from_inputs: Float[Tensor, "b i 3"]
+    from_points: Float[Tensor, "b p 2 3"]
+
+
+def step(asked: Asked, settings: StepSettings, gradient: bool = False) -> Answered:
+    """Step b transitions. With `gradient` also derivatives of the pose by everything else that is
+    given: rows by friction (t), compliance (t), angle of the normal (t), stiffness (3), command
+    before (3) and command (3), and by the outline points."""
+    from tpcd.simulator.batch import step_range
+    from tpcd.simulator.geometry import World
+    from tpcd.simulator.request import Answer, Request
+
+    count, terrains = len(asked.start), asked.offsets.shape[-1]
+    inputs, points = (3 * terrains + 9, asked.points.shape[1]) if gradient else (0, 0)
+    answered = Answered(
+        pose=torch.empty(count, 3, dtype=torch.float64),
+        mode=torch.empty(count, terrains, dtype=torch.int64),
+        status=torch.empty(count, dtype=torch.int64),
+        residual=torch.empty(count, dtype=torch.float64),
+        from_start=torch.empty(count, 3, 3, dtype=torch.float64),
+        from_gap=torch.empty(count, terrains, 3, dtype=torch.float64),
+        from_lever=torch.empty(count, terrains, 3, dtype=torch.float64),
+        contacts=torch.empty(count, terrains, 4, dtype=torch.float64),
+        from_inputs=torch.empty(count, inputs, 3, dtype=torch.float64),
+        from_points=torch.empty(count, points, 2, 3, dtype=torch.float64),
+    )
+    planes = (asked.normals, asked.offsets, asked.friction, asked.compliance)
+    outlines = asked.points.detach().mT.contiguous().numpy()
+    world = World(outlines, *(_array(value) for value in planes))
+    yields = bool((asked.compliance[asked.scene] != 0).any())
+    law = law_of(settings, terrains if yields else 0)
+    request = Request(
+        asked.outline.contiguous().numpy(),
+        asked.scene.contiguous().numpy(),
+        _array(asked.stiffness),
+        _array(asked.start),
+        _array(asked.start if asked.previous is None else asked.previous),
+        _array(asked.command),
+        asked.previous is None,
+        settings.substeps,
+        settings.finest,
+        settings.largest_turn,
+        settings.follow_path,
+    )
+    answer = Answer(*(value.numpy() for value in answered))
+    in_parts(lambda first, last: step_range(world, law, request, answer, first, last), count)
+    return answered
+
+
+def law_of(settings: StepSettings, yielding: int = 0) -> Law:
+    """Settings as the compiled loops read them, for so many terrains that may be `yielding`; the
+    stiffness is set for each transition."""
+    from tpcd.simulator.workspace import Law
+
+    return Law(
+        np.ones(3),
+        np.ones(3),
+        settings.friction == "coulomb",
+        settings.rounds,
+        settings.tolerance,
+        (0.0,) * (DEGREES + yielding),
+    )
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -18,6 +20,7 @@ from tpcd.effects.protocol import Added
 from tpcd.effects.simulate import simulate_rows
 from tpcd.effects.truth import EffectTruth, added_effects
 from tpcd.parameters import Parameters
+from tpcd.planar import rotate, wrap_angle
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import QuasistaticTruth, StepSettings
@@ -335,3 +338,19 @@ def test_a_loose_grasp_turns_with_the_torque_and_slips() -> None:
 def test_a_drifting_floor_rises_over_the_run() -> None:
     rows = run({"floor_drift": {"drift": 0.003}}, (0, -0.03, 0), (0, -0.03, 0), (0, -0.03, 0))
     torch.testing.assert_close(rows[:, 1], vector(0.001, 0.002, 0.003), rtol=0, atol=1e-7)
+
+
+def test_a_soft_grasp_twists_alike_wherever_the_angle_begins() -> None:
+    """An angle counted from elsewhere, across pi and beyond it, is the same arm."""
+    commands = [(0.0, -0.03, 0.05), (0.02, -0.03, 0.08)]
+    plain = run({"grasp_compliance": {"compliance": 0.05}}, *commands)
+    for turn in (math.pi, 1.5 * math.pi, -math.pi):
+        outline = rotate(vector(-turn), BOX)
+        hidden = added_effects({"grasp_compliance": {"compliance": 0.05}})
+        truth = EffectTruth(outline, FRICTION, 0.0, WALL_AT, STIFFNESS, hidden, len(commands))
+        truth.reset(vector(0.0, 0.01, turn))
+        for command, expected in zip(commands, plain, strict=True):
+            pose, wrench, _ = truth.step(vector(*command) + vector(0.0, 0.0, turn))
+            found = torch.cat((pose, wrench))
+            found[2] = wrap_angle(found[2] - turn)
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)

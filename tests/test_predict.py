@@ -14,7 +14,9 @@ import torch
 from tpcd.belief import EstimatorSettings, SamplerSettings, estimate
 from tpcd.belief.belief import Belief
 from tpcd.belief.storage import FORMAT_VERSION, load_belief, save_belief
+from tpcd.commands.prediction import rollout_rows
 from tpcd.errors import RunError
+from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
@@ -159,6 +161,28 @@ def test_rollouts_start_as_the_one_step_prediction(learnt) -> None:
     assert float((draws[:, 0].mean(0) - first.mean[0]).abs()[:3].max()) < 1e-3
     error = (draws.mean(0) - torch.cat((test.true.poses, test.true.wrenches), -1)[1:]).abs()
     assert float(error[:, :2].mean()) < 3e-3
+
+
+def test_rolled_out_angles_about_pi_are_not_averaged_to_zero(learnt) -> None:
+    belief, _, test = learnt
+    turn = torch.tensor([0.0, 0.0, math.pi], dtype=torch.float64)
+    there = replace(
+        test.measured, poses=test.measured.poses + turn, commands=test.measured.commands + turn
+    )
+
+    class Near(ContactPredictor):
+        """Trajectories that end on both sides of pi."""
+
+        def rollout(self, *_: object, samples: int) -> torch.Tensor:
+            draws = torch.zeros(samples, len(there) - 1, 6, dtype=torch.float64)
+            draws[..., 2] = torch.linspace(-1e-3, 1e-3, samples)[:, None].double() + math.pi
+            draws[..., 2] = wrap_angle(draws[..., 2])
+            return draws
+
+    rows = rollout_rows(Near(belief, 20), there, torch.Generator().manual_seed(0), of="true")
+    assert float(wrap_angle(rows.mean[:, 2] - math.pi).abs().max()) < 1e-4
+    assert float(rows.std[:, 2].max()) < 1e-3
+    assert float((rows.high - rows.low)[:, 2].max()) < 3e-3
 
 
 def test_particles_are_kept_by_weight(learnt) -> None:

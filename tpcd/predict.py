@@ -83,6 +83,9 @@ class ContactPredictor:
         `pose_std` is the noise of `pose` where it was measured (None: exact). With
         `sensor_std`, noise of the six channels, the prediction is of what sensors will read;
         without, of what will truly be. `keep_field` asks for `Prediction.component_field`.
+
+        Effects of time take rows of which each begins where the one before ended for a whole run,
+        from its start to its end, and others for the end of one.
         """
         pose, command, previous = _asked(pose, command, previous, unusual)
         start_variance = _variance("pose_std", pose_std, 3, unusual)

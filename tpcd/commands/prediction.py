@@ -91,6 +91,9 @@ def rollout_rows(
     least = LEAST_STD * torch.cat((torch.ones_like(episode.stiffness), episode.stiffness))
     added = torch.hypot(least, episode.sensor_std) if of == "measured" else least
     draws = draws + torch.randn(draws.shape, generator=generator, dtype=draws.dtype) * added
+    # Angles about their circular mean, or those around pi would be averaged to 0.
+    centre = torch.atan2(draws[..., 2].sin().mean(0), draws[..., 2].cos().mean(0))
+    draws[..., 2] = centre + wrap_angle(draws[..., 2] - centre)
     rows = measured_rows(reference or episode)[1:]
     levels = torch.tensor([0.05, 0.95], dtype=draws.dtype)
     low, high = torch.quantile(draws, levels, dim=0)

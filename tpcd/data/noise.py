@@ -25,6 +25,7 @@ from tpcd.contract import SENSOR_NAMES
 from tpcd.errors import EpisodeError
 from tpcd.planar import short_way
 from tpcd.quality.finding import Finding, Weight
+from tpcd.quality.habit import grid_step, resolution
 
 if TYPE_CHECKING:
     from tpcd.data.episode import Episode
@@ -43,6 +44,9 @@ SURE, LIKELY = 1e-6, 1e-4
 TOO_LARGE, TOO_SMALL, FAR_TOO_SMALL = 1 / 3, 2.0, 6.0
 """Scatter over stated noise at which it is refused as too large, doubted, and refused as too small:
 what the arm does besides may scatter as well."""
+FEWEST_LEVELS, ROUNDED = 8, 0.5
+"""Different readings from which steps can be told, and the part of the stated noise from which what
+rounding adds is told."""
 NEAR = 0.2
 """Readings count as near where they would be within so many standard deviations."""
 
@@ -67,12 +71,6 @@ class NoiseEstimate:
             f"sensor_std estimated as [{values}] from repeated commands, free rows and"
             f" w - K (x - u); good to about {error:.0%}, which is added"
         )
-
-
-def resolution(values: Float[np.ndarray, " n"]) -> float:
-    """The smallest step between readings; 0 where all are equal."""
-    steps = np.diff(np.unique(values))
-    return float(steps.min()) if len(steps) else 0.0
 
 
 def estimate_noise(episodes: Sequence[Episode]) -> NoiseEstimate | None:
@@ -150,7 +148,7 @@ def check_noise(episode: Episode) -> list[str]:
                 "give one standard deviation in SI units, or leave sensor_std out for"
                 " scripts/diagnose.py to estimate it",
             )
-    warnings = []
+    warnings = _coarse(episode)
     for name, k, ratio, freedom, source in measured:
         p = chi2.sf(ratio**2 * freedom, freedom) if freedom else 1.0
         if stated[k] <= 0 or ratio < TOO_SMALL or p > LIKELY:
@@ -162,6 +160,27 @@ def check_noise(episode: Episode) -> list[str]:
             )
         warnings.append(f"{told}: it is too small, or the arm creeps or lags")
     return warnings
+
+
+def _coarse(episode: Episode) -> list[str]:
+    """Sentences on channels that were rounded to steps of which the stated noise does not know."""
+    found = []
+    for k, name in enumerate(SENSOR_NAMES):
+        column, stated = _readings(episode)[1:, k], float(episode.sensor_std[k])
+        if len(np.unique(column)) < FEWEST_LEVELS or not stated > 0:
+            continue
+        step = grid_step(column)
+        # A value that was rounded is anywhere within its step.
+        scatter = step / math.sqrt(12.0)
+        whole = (column - column.min()) / step if step > 0 else column
+        if scatter < ROUNDED * stated or np.abs(whole - np.round(whole)).max() > 1e-3:
+            continue
+        both = math.hypot(stated, scatter)
+        found.append(
+            f"{name} is in steps of {step:.2g}, which scatter it by {scatter:.2g}, but its"
+            f" sensor_std is {stated:.2g}: give all digits, or {both:.2g} as sensor_std"
+        )
+    return found
 
 
 def noise_findings(episode: Episode) -> list[Finding]:

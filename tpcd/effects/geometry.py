@@ -10,6 +10,7 @@ from torch import Tensor
 from tpcd.effects.conditions import FLOOR, WALL, Conditions, Outcome, Rows
 from tpcd.effects.declare import DeclaredEffect, column
 from tpcd.effects.protocol import EffectParameter
+from tpcd.planar import wrap_angle
 
 _DEGREE = {"shown_unit": "deg", "shown_factor": 57.29578}
 
@@ -101,7 +102,7 @@ def _grasp_compliance(
 ) -> Conditions:
     if outcome is None:
         return conditions
-    twist = outcome.pose[..., 2:] - conditions.command[..., 2:]
+    twist = wrap_angle(outcome.pose[..., 2:] - conditions.command[..., 2:])
     torque = conditions.stiffness[..., 2:] * twist - conditions.load[..., 2:]
     return replace(conditions, turn=conditions.turn + column(values, 0)[..., None] * torque)
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from tpcd.planar import spring_wrench
 from tpcd.quality.finding import Finding, Weight
+from tpcd.quality.habit import resolution
 
 POSES = ("x", "z", "phi")
 WRENCHES = ("F_x", "F_z", "tau")
@@ -62,7 +63,7 @@ def check_repeats(
             axis = int(np.argmax(left / noise))
             found.append(_frozen(POSES, poses[first], first, end, left[axis], axis))
     for axis in range(3):
-        column, step = wrenches[:, axis], _resolution(wrenches[:, axis])
+        column, step = wrenches[:, axis], resolution(wrenches[:, axis])
         limit = noise[axis] + step
         ends = _at_end(column, expected[:, axis], noise[axis] - LEAST[axis], LEAST[axis] + step)
         found += [_clipped(axis, value, rows) for value, rows in ends]
@@ -93,12 +94,6 @@ def _free(readings: Float[np.ndarray, "n w"], first: int, end: int) -> bool:
     if 2 * (end - first) > len(readings):
         return False
     return first == 0 or int(same.sum()) > end - first
-
-
-def _resolution(column: Float[np.ndarray, " n"]) -> float:
-    """The smallest step between readings; 0 where all are equal."""
-    gaps = np.diff(np.unique(column))
-    return float(gaps.min()) if len(gaps) else 0.0
 
 
 def _at_end(

@@ -138,3 +138,9 @@ def grid_step(values: Float[np.ndarray, " n"]) -> float:
 def middle(step: float, noise: float) -> float:
     """How often a reading repeats whose value is in the middle of a step: at most so often."""
     return math.erf(step / (2.0 * math.sqrt(2.0) * noise)) if noise > 0 else 0.0
+
+
+def resolution(values: Float[np.ndarray, " n"]) -> float:
+    """The smallest step between readings; 0 where all are equal."""
+    steps = np.diff(np.unique(values))
+    return float(steps.min()) if len(steps) else 0.0

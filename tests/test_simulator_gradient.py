@@ -6,7 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from contact_scenes import BOX, SLAB, STIFFNESS, make_scene, vector
+from contact_scenes import (
+    BOX,
+    SLAB,
+    STIFFNESS,
+    make_scene,
+    many_random_transitions,
+    vector,
+)
 
 from tpcd.contact import ContactScene, place_points, scene_from_parameters
 from tpcd.parameters import Parameters
@@ -16,6 +23,7 @@ from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.household import ENTRIES
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import ContactMode, StepSettings, StepStatus, simulate_step
+from tpcd.terrain import HalfPlane
 
 FREE, STICK, RIGHT, LEFT = ContactMode
 CASES = {
@@ -40,6 +48,7 @@ def inputs_of(case: str) -> tuple[torch.Tensor, ...]:
         vector(0.0),
         vector(0.3),
         vector(1.0, 0.5),
+        vector(0.0, 0.0),
         vector(*start),
         vector(*command),
         STIFFNESS,
@@ -49,9 +58,15 @@ def inputs_of(case: str) -> tuple[torch.Tensor, ...]:
 
 def answer(settings, compliance, points, *given):
     """Of one or a batch of inputs; the stiffness is shared by the batch."""
-    friction, height, position, softer, start, command, stiffness = given
-    scene = make_scene(
-        points, friction[..., 0], height[..., 0], position[..., 0], compliance * softer
+    friction, height, position, softer, tilt, start, command, stiffness = given
+    normals = rotate(tilt, vector([0.0, 1.0], [-1.0, 0.0]))
+    offsets = torch.cat((height, -position), dim=-1)
+    planes = zip(normals.unbind(-2), offsets.unbind(-1), strict=True)
+    scene = ContactScene(
+        points,
+        tuple(HalfPlane(*plane) for plane in planes),
+        torch.cat((friction, friction), dim=-1),
+        compliance * softer,
     )
     return simulate_step(scene, start, command, stiffness, settings)
 
@@ -249,3 +264,26 @@ def test_scenes_from_parameters_place_the_outline():
     lifted = replace(parameters, floor_height=parameters.floor_height + 0.1)
     higher = scene_from_parameters(shape, lifted).terrains[0].signed_distance(points)
     torch.testing.assert_close(higher, scene.terrains[0].signed_distance(points) - 0.1)
+
+
+def test_asking_for_a_gradient_changes_no_bit_and_a_second_one_is_refused():
+    scene, start, command = many_random_transitions(10, seed=68)
+    silent = simulate_step(scene, start, command, STIFFNESS)
+    command = command.requires_grad_()
+    traced = simulate_step(scene, start, command, STIFFNESS)
+    for name, value in vars(silent).items():
+        assert torch.equal(value, getattr(traced, name).detach()), name
+    with pytest.raises(RuntimeError, match="differentiable once; leave out create_graph"):
+        torch.autograd.grad(traced.pose.sum(), command, create_graph=True)
+
+
+def test_gradients_that_are_not_asked_for_cost_nothing_and_are_none():
+    scene, start, command = many_random_transitions(5, seed=69)
+    friction = scene.friction.clone().requires_grad_()
+    found = simulate_step(replace(scene, friction=friction), start, command, STIFFNESS)
+    assert found.pose.requires_grad and not found.mode.requires_grad
+    assert not found.pose_from_start.requires_grad and not found.contacts.requires_grad
+    with torch.no_grad():
+        assert not simulate_step(
+            scene, start, command.requires_grad_(), STIFFNESS
+        ).pose.requires_grad

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from tpcd.contact import ContactScene
 from tpcd.contract import as_numbers, check_lengths, check_pose, check_stiffness, one_batch
@@ -207,9 +206,10 @@ class _Settle(torch.autograd.Function):
         return tuple(found)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, by_pose: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         """What a number answers to the inputs, from what it answers to the settled pose."""
+        if torch.is_grad_enabled():
+            raise RuntimeError("a step is differentiable once; leave out create_graph=True")
         status, from_start, from_gap, from_inputs, from_points, *places = ctx.saved_tensors
         normals, outline, scene = places
         outlines, scenes, shared = ctx.sizes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,6 +28,9 @@ class Estimate:
     misfit: float | None = None
     """Median of the outline error's standard deviation [m]; by default the prior's own figure, or
     as many times that as --model says."""
+    solver: Literal["native", "qpth"] = "native"
+    """Backend of the contact problems; `qpth` is there to compare with and takes some hundred times
+    as long."""
     seed: int = 0
     """Seed of all random numbers."""
     resume: bool = False
@@ -52,6 +55,7 @@ def estimate_episode(config: Estimate) -> None:
     from torch.utils.tensorboard import SummaryWriter
 
     from tpcd.belief import EstimatorSettings, SamplerSettings
+    from tpcd.belief.paper import PAPER_STEP, PaperSettings
     from tpcd.belief.state import STATE_FILE, load_state
     from tpcd.commands.estimation import run_estimation
     from tpcd.commands.kept_model import check_kept_model, keep_model, model_of
@@ -102,12 +106,13 @@ def estimate_episode(config: Estimate) -> None:
         state = load_state(folder, episode, config.prior)
         settings = EstimatorSettings(
             sampler=SamplerSettings(particles=config.particles),
-            step=model.step,
+            step=replace(model.step, solver=config.solver),
             misfit_sd=config.misfit,
             effects=model.informed,
             shape=model.shape,
         )
-        estimator = Estimator(shape, config.estimator, settings)
+        filtered = PaperSettings(step=replace(PAPER_STEP, solver=config.solver))
+        estimator = Estimator(shape, config.estimator, settings, filtered)
         steps = estimator.steps(episode, torch.Generator().manual_seed(config.seed), state)
         belief = run_estimation(
             steps, episode, config.prior, folder, state=state, closing=estimator.closing

@@ -47,6 +47,7 @@ from tpcd.threads import in_parts
 
 if TYPE_CHECKING:
     from tpcd.belief.kernel_given import SceneSlopes
+    from tpcd.simulator.workspace import Law, Tape
 
 OUTLIER_SQUARE = 16.3
 """Squared Mahalanobis distance (3 degrees of freedom, 0.1 %) from which a transition counts
@@ -127,6 +128,7 @@ def filter_history(
     """
     from tpcd.belief.kernel import explain_range
     from tpcd.belief.kernel_given import Found, Given, Measured, SceneSlopes
+    from tpcd.simulator.backends import solved_by
 
     conditions, merged = setting.conditions, setting.merged
     count, n = len(misfit_sd), len(setting.used)
@@ -203,9 +205,16 @@ def filter_history(
     soft = (conditions.compliance != 0).flatten(1).any(-1).expand(count)
     for yielding, group in ((0, ~soft), (terrains, soft)):
         law, which = law_of(settings, yielding), torch.nonzero(group).flatten().numpy()
-        explain = partial(explain_range, points, law, given, measured, by_theta, found, which)
+
+        def run(tape: Tape, law: Law = law, which: np.ndarray = which) -> None:
+            work = partial(
+                explain_range, points, law, given, measured, by_theta, found, tape, which
+            )
+            in_parts(work, len(which), n)
+
         if len(which):
-            in_parts(explain, len(which), n)
+            device = points_ee.device
+            solved_by(settings.solver, run, group.numpy(), len(law.room), terrains, device)
     answer = HistoryLikelihood(total, mean, covariance)
     if innovations:
         answer = replace(answer, whitened=whitened, log_scale=log_scale, slopes=slopes)

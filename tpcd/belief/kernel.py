@@ -36,8 +36,9 @@ from tpcd.simulator.request import (
     prepare,
     set_stiffness,
 )
+from tpcd.simulator.rest import WANTED
 from tpcd.simulator.tangents import BY_SCENE, NOTHING_MORE, new_slopes
-from tpcd.simulator.workspace import new_space
+from tpcd.simulator.workspace import begin_recall, end_recall, new_space
 
 
 def _compile_explain_range(stamp: int) -> Callable[..., None]:
@@ -45,22 +46,22 @@ def _compile_explain_range(stamp: int) -> Callable[..., None]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     @no_type_check
-    def explain_range(points, law, given, measured, by_theta, found, which, first, last):
+    def explain_range(points, law, given, measured, by_theta, found, tape, which, first, last):
         if stamp >= 0:
-            _explain_range(points, law, given, measured, by_theta, found, which, first, last)
+            _explain_range(points, law, given, measured, by_theta, found, tape, which, first, last)
 
     return explain_range
 
 
 @njit(inline="always")
 @no_type_check
-def _explain_range(points, law, given, measured, by_theta, found, which, first, last):
+def _explain_range(points, law, given, measured, by_theta, found, tape, which, first, last):
     """Evaluate the particles in `which` from `first` up to `last`; `points` (m, 2, p) are the
     outlines of all."""
     terrains, count = given.offsets.shape[2], points.shape[2]
     steps, size = measured.used.shape[0], found.mean.shape[1]
     entries = by_theta.offsets.shape[1]
-    chains, space = new_chains(terrains, count), new_space(terrains, law.room)
+    chains, space = new_chains(terrains, count), new_space(terrains, law.room, tape.motion.shape[1])
     slopes = new_slopes(terrains, count, BY_SCENE if entries else NOTHING_MORE, law.room)
     theta = np.zeros((entries, 3))
     poses = np.zeros((7, 3))
@@ -98,8 +99,11 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
     here = World(np.zeros((1, 2, count)), normals, offsets, friction, compliance)
     law = own_law(law)
     for i in which[first:last]:
+        if not begin_recall(space, tape, i):
+            continue
         found.total[i] = -np.inf
         if not math.isfinite(measured.sd[i]) or not measured.least[i] < np.inf:
+            end_recall(space, tape, i)
             continue
         seen = i if measured.poses.shape[0] > 1 else 0
         asked = i if given.commands.shape[0] > 1 else 0
@@ -143,6 +147,8 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
                 for t in range(terrains):
                     here.offsets[0, t] -= state.gap[t]
                 step_element(here, 0, chains, law, extent, request, k, answer, space, slopes, poses)
+                if answer.statuses[k] == WANTED:
+                    break
                 answer.poses[k, 2] -= ends
                 for a in range(3):
                     answer.poses[k, a] += measured.give[seen, k + 1, a]
@@ -162,6 +168,8 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
                 else:
                     break
                 copy_state(state.mean_before, state.covariance_before, state.mean, state.covariance)
+            if answer.statuses[k] == WANTED:
+                break
             if found.poses.shape[0] > 0:
                 _keep(found, answer, i, k)
             total += term
@@ -174,6 +182,7 @@ def _explain_range(points, law, given, measured, by_theta, found, which, first, 
             if not (total + measured.rest[seen, k] >= measured.least[i] and math.isfinite(total)):
                 total = -np.inf
                 break
+        end_recall(space, tape, i)
         found.total[i] = total
         for a in range(size):
             found.mean[i, a] = state.mean[a]
@@ -262,7 +271,7 @@ explain_range = _compile_explain_range(
     source_stamp(sys.modules[__name__], filter, kernel_filter, kernel_given, kernel_state)
 )
 """Evaluate the particles `which[first:last]`: (points, law, given, measured, by_theta, found,
-which, first, last).
+tape, which, first, last).
 
 Fills their part of `found` in place and releases the interpreter lock meanwhile.
 """

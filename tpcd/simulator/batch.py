@@ -35,7 +35,7 @@ from tpcd.simulator.element import step_element
 from tpcd.simulator.geometry import World, new_chains
 from tpcd.simulator.request import new_planes, own_law, prepare, set_planes, set_stiffness
 from tpcd.simulator.tangents import BY_ALL, NOTHING_MORE, new_slopes
-from tpcd.simulator.workspace import new_space
+from tpcd.simulator.workspace import begin_recall, end_recall, new_space
 
 _SOURCES = (
     active_set, elastic, element, events, geometry, loops, parameters, path, problem, record,
@@ -61,19 +61,19 @@ def _compile_step_range(stamp: int) -> Callable[..., None]:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     @no_type_check
-    def step_range(world, law, asked, answer, first, last):
+    def step_range(world, law, asked, answer, tape, first, last):
         if stamp >= 0:
-            _step_range(world, law, asked, answer, first, last)
+            _step_range(world, law, asked, answer, tape, first, last)
 
     return step_range
 
 
 @njit(inline="always")
 @no_type_check
-def _step_range(world, law, asked, answer, first, last):
+def _step_range(world, law, asked, answer, tape, first, last):
     """Step the transitions from `first` up to `last`."""
     terrains, count = world.normals.shape[1], world.points.shape[2]
-    chains, space = new_chains(terrains, count), new_space(terrains, law.room)
+    chains, space = new_chains(terrains, count), new_space(terrains, law.room, tape.motion.shape[1])
     level = BY_ALL if answer.from_inputs.shape[1] > 0 else NOTHING_MORE
     slopes = new_slopes(terrains, count, level, law.room)
     poses = np.zeros((7, 3))
@@ -89,14 +89,17 @@ def _step_range(world, law, asked, answer, first, last):
         set_planes(here, world, asked.place[b])
         extent = prepare(here, 0, law, asked, b, end, chains)
         for i in range(b, end):
+            if not begin_recall(space, tape, i):
+                continue
             set_planes(here, world, asked.place[i])
             set_stiffness(law, asked.stiffness[i if asked.stiffness.shape[0] > 1 else 0])
             step_element(here, 0, chains, law, extent, asked, i, answer, space, slopes, poses)
+            end_recall(space, tape, i)
         b = end
 
 
 step_range = _compile_step_range(source_stamp())
-"""Step the transitions `first` up to `last`: (world, law, asked, answer, first, last).
+"""Step the transitions `first` up to `last`: (world, law, asked, answer, tape, first, last).
 
 Fills their part of the answer in place and releases the interpreter lock meanwhile.
 """

@@ -42,6 +42,7 @@ from tpcd.simulator.rest import (
     NOT_CONVERGED,
     RELAXED,
     START_INSIDE,
+    WANTED,
     settle,
 )
 from tpcd.simulator.tangents import (
@@ -129,6 +130,9 @@ def step_element(
                     world, o, chains, law, extent, landing, part, space, pose,
                     attempt != SLIPPING, attempt == FRICTIONLESS,
                 )  # fmt: skip
+                if ended == WANTED:
+                    answer.statuses[b] = WANTED
+                    return
                 load = 0.0
                 for j in range(len(space.room)):
                     load += space.multiplier[j]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from tpcd.simulator.record import DEGREES, StepSettings
 from tpcd.threads import in_parts
 
 if TYPE_CHECKING:
-    from tpcd.simulator.workspace import Law
+    from tpcd.simulator.workspace import Law, Tape
 
 
 class Asked(NamedTuple):
@@ -50,10 +51,17 @@ class Answered(NamedTuple):
     from_points: Float[Tensor, "b p 2 3"]
 
 
-def step(asked: Asked, settings: StepSettings, gradient: bool = False) -> Answered:
+def step(
+    asked: Asked,
+    settings: StepSettings,
+    gradient: bool = False,
+    device: torch.device | None = None,
+) -> Answered:
     """Step b transitions. With `gradient` also derivatives of the pose by everything else that is
     given: rows by friction (t), compliance (t), angle of the normal (t), stiffness (3), command
-    before (3) and command (3), and by the outline points."""
+    before (3) and command (3), and by the outline points. A backend other than `native` works on
+    the `device` (None: the CPU)."""
+    from tpcd.simulator.backends import solved_by
     from tpcd.simulator.batch import step_range
     from tpcd.simulator.geometry import World
     from tpcd.simulator.request import Answer, Request
@@ -91,7 +99,13 @@ def step(asked: Asked, settings: StepSettings, gradient: bool = False) -> Answer
         settings.follow_path,
     )
     answer = Answer(*(value.numpy() for value in answered))
-    in_parts(lambda first, last: step_range(world, law, request, answer, first, last), count)
+
+    def run(tape: Tape) -> None:
+        work = partial(step_range, world, law, request, answer, tape)
+        in_parts(work, count)
+
+    wanted = np.ones(count, np.bool_)
+    solved_by(settings.solver, run, wanted, len(law.room), terrains, device or torch.device("cpu"))
     return answered
 
 

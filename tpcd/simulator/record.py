@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tpcd.parameters import LARGEST_FRICTION
+from tpcd.qp.solve import BACKENDS
 
 DEGREES = 3
 """Degrees of freedom of the object in the plane."""
@@ -93,6 +94,9 @@ class StepSettings:
     """Cut every step into at least `substeps` parts, whether contact changes or not."""
     rounds: int = 20
     """Cap on re-linearisations of geometry and friction in one substep."""
+    solver: Literal["native", "qpth"] = "native"
+    """Backend of the contact problems (see `tpcd.qp`): `qpth` is slower by some hundred times, and
+    what it gets wrong is told by status and residual."""
     tolerance: float = 1e-7
     """A substep has settled when a round moves no point, and no friction a gap, by more than this
     [m]."""
@@ -101,6 +105,9 @@ class StepSettings:
         """Refuse settings that mean nothing."""
         if self.friction not in ("coulomb", "anitescu"):
             raise ValueError(f"friction is {self.friction!r}, expected 'coulomb' or 'anitescu'")
+        if self.solver not in BACKENDS:
+            told = ", ".join(BACKENDS)
+            raise ValueError(f"solver is {self.solver!r}, expected one of {told}")
         for name in ("substeps", "rounds"):
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= MOST_PARTS:

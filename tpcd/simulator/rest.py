@@ -53,9 +53,11 @@ NEAR = 1e-4
 CONVERGED, START_INSIDE = int(StepStatus.CONVERGED), int(StepStatus.START_INSIDE)
 NOT_CONVERGED, RELAXED = int(StepStatus.NOT_CONVERGED), int(StepStatus.RELAXED)
 INVALID = int(StepStatus.INVALID_INPUT)
+WANTED = INVALID + 1
+"""Status of an element that waits for the solution of a contact problem by another backend."""
 _SOFT = math.sqrt(RELAXATION)
 """What a row that gives way has on its own variable, in whitened units."""
-_SOLVED = int(Status.SOLVED)
+_SOLVED, _SHORT = int(Status.SOLVED), int(Status.ITERATION_LIMIT)
 
 
 @inner(error_model="numpy", forceinline=True)
@@ -84,7 +86,9 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh, g
         _list_candidates(world, o, chains, law, start, start_turn, pose, turn, k, give_way, space)
         m = _build_rows(world, o, law, command, pose, turn, space)
         found = _solve(m, space)
-        if found != _SOLVED:
+        if found == WANTED:
+            return WANTED, np.inf
+        if found != _SOLVED and found != _SHORT:
             status = RELAXED
             if not give_way:
                 return status, np.inf
@@ -128,10 +132,45 @@ def _roughest(world, o, law):
     return largest
 
 
+@inner
+@no_type_check
+def _recalled(m, space):
+    """The solution that another backend found for the m rows; `WANTED` where it has none yet."""
+    recall = space.recall
+    c = recall.cursor[0]
+    if c == recall.cursor[1]:
+        recall.cursor[2] = m
+        return WANTED
+    recall.cursor[0] = c + 1
+    for a in range(len(space.room)):
+        space.motion[a] = recall.motion[c, a]
+    for r in range(m):
+        space.multipliers[r] = recall.multipliers[c, r]
+    _take_most_loaded(m, space)
+    return recall.status[c]
+
+
+@inner
+@no_type_check
+def _take_most_loaded(m, space):
+    """Take the rows that bear most load for those that carry it."""
+    for j in range(len(space.room)):
+        best, most = -1, 0.0
+        for r in range(m):
+            taken = False
+            for i in range(j):
+                taken = taken or space.slots[i] == r
+            if not taken and space.multipliers[r] > most:
+                best, most = r, space.multipliers[r]
+        space.slots[j] = best
+
+
 @inner(forceinline=True)
 @no_type_check
 def _solve(m, space):
     """Solve the contact problem of the m rows that were built."""
+    if space.recall.cursor[1] >= 0:
+        return _recalled(m, space)
     if len(space.room) == 3:
         found, _ = solve_whitened_3(
             space.rows, space.values, space.sizes, m, space.motion, space.multipliers,
@@ -167,18 +206,9 @@ def _give_way(m, space):
     )  # fmt: skip
     for a in range(k):
         space.motion[a] = elastic.motion[a]
-        space.slots[a] = -1
     for r in range(m):
         space.multipliers[r] *= shrink
-    for j in range(k):
-        best, most = -1, 0.0
-        for r in range(m):
-            taken = False
-            for i in range(j):
-                taken = taken or space.slots[i] == r
-            if not taken and space.multipliers[r] > most:
-                best, most = r, space.multipliers[r]
-        space.slots[j] = best
+    _take_most_loaded(m, space)
 
 
 @inner(forceinline=True)

@@ -73,10 +73,10 @@ def simulate_step(
     yields = scene.yields.reshape(-1)[asked.scene.to(device)].cpu()
     groups = [torch.nonzero(group).flatten() for group in (~yields, yields) if bool(group.any())]
     if len(groups) < 2:
-        found = _settle(asked, settings)
+        found = _settle(asked, settings, device)
     else:
         # Rigid scenes apart from those that yield: no answer depends on what is beside it.
-        parts = [_settle(_part(asked, index), settings) for index in groups]
+        parts = [_settle(_part(asked, index), settings, device) for index in groups]
         back = torch.cat(groups).argsort()
         found = Answered(*(torch.cat(both)[back] for both in zip(*parts, strict=True)))
     turn = asked.start[:, 2] + wrap_angle(asked.command[:, 2] - asked.start[:, 2])
@@ -181,11 +181,11 @@ def _part(asked: Asked, index: Tensor) -> Asked:
     return asked._replace(**{n: v if v is None else v[index] for n, v in values.items()})
 
 
-def _settle(asked: Asked, settings: StepSettings) -> Answered:
+def _settle(asked: Asked, settings: StepSettings, device: torch.device) -> Answered:
     floating = [value for value in asked[:-2] if value is not None]
     if needs_gradient(*floating):
-        return Answered(*_Settle.apply(settings, *asked))
-    return step(asked, settings)
+        return Answered(*_Settle.apply(settings, device, *asked))
+    return step(asked, settings, device=device)
 
 
 class _Settle(torch.autograd.Function):
@@ -193,10 +193,12 @@ class _Settle(torch.autograd.Function):
     the way back is a contraction. Only the pose is differentiable."""
 
     @staticmethod
-    def forward(ctx: Any, settings: StepSettings, *inputs: Any) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, settings: StepSettings, device: torch.device, *inputs: Any
+    ) -> tuple[Tensor, ...]:
         """Step, and keep the derivatives."""
         asked = Asked(*inputs)
-        found = step(asked, settings, gradient=True)
+        found = step(asked, settings, gradient=True, device=device)
         ctx.mark_non_differentiable(*found[1:])
         ctx.save_for_backward(
             found.status, found.from_start, found.from_gap, found.from_inputs, found.from_points,
@@ -229,8 +231,9 @@ class _Settle(torch.autograd.Function):
             sizes, -1
         )
         across = torch.stack((-normals[..., 1], normals[..., 0]), dim=-1)
-        given = ctx.needs_input_grad[1:]
+        given = ctx.needs_input_grad[2:]
         return (
+            None,
             None,
             gathered(pulled(from_points), outline, outlines) if given[0] else None,
             gathered(angle, scene, scenes)[..., None] * across,

@@ -57,6 +57,36 @@ class Elastic(NamedTuple):
     work: np.ndarray
 
 
+class Tape(NamedTuple):
+    """Solutions of the contact problems of b elements by another backend, in the order in which
+    they come up, and the problem that comes next.
+
+    `motion` (b, c, k), `multipliers` (b, c, w) and `status` (b, c) of problems whose solution is
+    `known` (b); the next one has `wanted` (b) unit whitened rows, 0 where an element is done,
+    `rows` (b, w, k) and `values` (b, w). Without elements (b = 0) problems are solved where they
+    come up.
+    """
+
+    motion: np.ndarray
+    multipliers: np.ndarray
+    status: np.ndarray
+    known: np.ndarray
+    wanted: np.ndarray
+    rows: np.ndarray
+    values: np.ndarray
+
+
+class Recall(NamedTuple):
+    """The tape of one element: `motion` (c, k), `multipliers` (c, w), `status` (c), and in `cursor`
+    (3) the next problem, how many solutions are known (-1: solve it here), and the rows that the
+    next problem has, once it is reached."""
+
+    motion: np.ndarray
+    multipliers: np.ndarray
+    status: np.ndarray
+    cursor: np.ndarray
+
+
 class Space(NamedTuple):
     """Everything one element works on.
 
@@ -96,12 +126,14 @@ class Space(NamedTuple):
     margins: np.ndarray
     friction: np.ndarray
     elastic: Elastic
+    recall: Recall
 
 
 @inner(_nrt=True)
 @no_type_check
-def new_space(terrains, room):
-    """Room for one element at a time against so many terrains, and for so many loaded rows."""
+def new_space(terrains, room, calls):
+    """Room for one element at a time against so many terrains, for so many loaded rows, and for so
+    many solutions of another backend."""
     width, k = 2 * terrains * LIST, len(room)
     return Space(
         room,
@@ -144,4 +176,43 @@ def new_space(terrains, room):
             np.zeros(width, np.int64),
             np.empty((width + 5, k + width)),
         ),
+        Recall(
+            np.empty((calls, k)),
+            np.empty((calls, width)),
+            np.zeros(calls, np.int64),
+            np.array([0, -1, 0]),
+        ),
     )
+
+
+@inner
+@no_type_check
+def begin_recall(space, tape, b):
+    """Take over what is known of element b; whether it is to be evaluated."""
+    cursor = space.recall.cursor
+    cursor[0], cursor[1], cursor[2] = 0, -1, 0
+    if len(tape.known) == 0:
+        return True
+    if tape.wanted[b] == 0:
+        return False
+    cursor[1] = tape.known[b]
+    for c in range(tape.known[b]):
+        for a in range(len(space.room)):
+            space.recall.motion[c, a] = tape.motion[b, c, a]
+        for r in range(space.multipliers.shape[0]):
+            space.recall.multipliers[c, r] = tape.multipliers[b, c, r]
+        space.recall.status[c] = tape.status[b, c]
+    return True
+
+
+@inner
+@no_type_check
+def end_recall(space, tape, b):
+    """Leave the problem that came up last, if its solution is not known."""
+    if len(tape.known) == 0:
+        return
+    tape.wanted[b] = space.recall.cursor[2]
+    for r in range(space.recall.cursor[2]):
+        tape.values[b, r] = space.values[r]
+        for a in range(len(space.room)):
+            tape.rows[b, r, a] = space.rows[r, a]

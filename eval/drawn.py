@@ -60,7 +60,7 @@ def draw_episode(
         draw = torch.rand(2, generator=generator, dtype=torch.float64)
         start[0] = -LEFTMOST_START * draw[0]
         start[1] = low + draw[1] * (high - low + HIGHEST_START)
-        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, start)
+        gaps = terrain_gaps(scene, start)
         left = misfit_sd * field.uncovered(field.basis(start[2])[0]).sqrt() * normal(terrains)
         floor_gap, wall_gap = gaps.amin(-1) + field.gap(coefficients, start[2]) + left
         if 0 < floor_gap < LARGEST_GAP and wall_gap > 0:

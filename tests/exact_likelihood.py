@@ -100,7 +100,7 @@ def _log_likelihood(
     terrains, count = len(scene.terrains), len(pose)
     friction = scene.friction.expand(count, -1)
     many = ContactScene(scene.points_ee[None], scene.terrains, friction)
-    gaps, _ = terrain_gaps(many.points_ee, many.terrains, pose)
+    gaps = terrain_gaps(many, pose)
     free = gaps.amin(-1) + field.gap(coefficients, history.poses[0, 2].expand(count)) > 0
     total = torch.where(free.all(-1), 0.0, -math.inf).double()
     for k in range(len(history)):

@@ -211,10 +211,8 @@ def _touching(
     points = transform_points(read + moved, scene.points_ee)
     found = []
     for t, terrain in enumerate(scene.terrains):
-        distance, nearest = terrain.signed_distance(points).min(-1)
-        index = nearest[:, None, None].expand(-1, 1, 2)
-        normal = terrain.normal(points.gather(1, index))[:, 0]
-        held = ((read - pose)[:, :2] * normal).sum(-1) > FAR
+        distance = terrain.signed_distance(points).amin(-1)
+        held = ((read - pose)[:, :2] * terrain.direction).sum(-1) > FAR
         free = mode[:, t] == int(ContactMode.FREE)
         found.append(torch.where(held & free, -distance, torch.inf))
     return torch.stack(found, -1)

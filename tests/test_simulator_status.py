@@ -38,7 +38,7 @@ def rough(scene: ContactScene, friction: float) -> ContactScene:
 
 def depth(scene: ContactScene, found: Transition) -> Tensor:
     """How deep the answers are inside terrains that have yielded to their load [m]."""
-    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, found.pose)
+    gaps = terrain_gaps(scene, found.pose)
     return -(gaps.amin(-1) + scene.compliance * found.contacts[..., 0]).amin(-1)
 
 

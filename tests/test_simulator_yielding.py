@@ -28,7 +28,7 @@ def softened(scene: ContactScene, seed: int = 5, most: float = 1e-3) -> ContactS
 
 
 def lowest(scene: ContactScene, pose: torch.Tensor) -> torch.Tensor:
-    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, pose)
+    gaps = terrain_gaps(scene, pose)
     return gaps.amin(-1)
 
 
@@ -93,7 +93,7 @@ def _energy(command: torch.Tensor, variables: np.ndarray) -> float:
 def _room(scene: ContactScene, variables: np.ndarray) -> np.ndarray:
     """Gaps of all points to terrains that have yielded [m]."""
     pose, taken = torch.as_tensor(variables).split((3, 2))
-    gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, pose[None])
+    gaps = terrain_gaps(scene, pose[None])
     return (gaps[0] + (scene.compliance[0].sqrt() * taken)[:, None]).flatten().numpy()
 
 

@@ -1,10 +1,5 @@
-"""Contact geometry: which points of the held object come near which terrain, and how.
-
-A `ContactScene` holds, for each element of the batch, the outline of the object in the
-end-effector frame and the terrains it can touch. For a pose it gives gaps, contact frames
-and point Jacobians; the Jacobian of a world point p = x + R(angle) r with respect to the
-pose (x, z, angle) is [I | R r turned by 90 degrees].
-"""
+"""The scene of a contact step: the outline of the held object in the end-effector frame, and the
+terrains that it can touch, for each element of a batch."""
 
 from __future__ import annotations
 
@@ -16,9 +11,9 @@ from torch import Tensor
 
 from tpcd.contract import as_numbers, one_batch
 from tpcd.parameters import Parameters
-from tpcd.planar import perpendicular, rotate, transform_points
+from tpcd.planar import transform_points
 from tpcd.shape.protocol import Shape
-from tpcd.terrain import HalfPlane, Terrain, floor, wall
+from tpcd.terrain import HalfPlane, floor, wall
 
 
 @dataclass(frozen=True)
@@ -33,7 +28,7 @@ class ContactScene:
     """
 
     points_ee: Float[Tensor, "*#batch p 2"]
-    terrains: tuple[Terrain, ...]
+    terrains: tuple[HalfPlane, ...]
     friction: Float[Tensor, "*batch t"]
     compliance: Float[Tensor, "*batch t"] = None  # type: ignore[assignment]
 
@@ -52,13 +47,12 @@ class ContactScene:
             "compliance": compliance.shape[:-1],
         }
         for t, body in enumerate(self.terrains):
-            if isinstance(body, HalfPlane):
-                shapes[f"direction of terrain {t}"] = body.direction.shape[:-1]
-                shapes[f"offset of terrain {t}"] = body.offset.shape
+            if not isinstance(body, HalfPlane):
+                raise TypeError(f"terrain {t} is a {type(body).__name__}, expected a HalfPlane")
+            shapes[f"direction of terrain {t}"] = body.direction.shape[:-1]
+            shapes[f"offset of terrain {t}"] = body.offset.shape
         batch = one_batch(shapes)
-        terrains = tuple(
-            body.expand(batch) if isinstance(body, HalfPlane) else body for body in self.terrains
-        )
+        terrains = tuple(body.expand(batch) for body in self.terrains)
         object.__setattr__(self, "points_ee", points)
         object.__setattr__(self, "terrains", terrains)
         object.__setattr__(self, "friction", friction.expand(*batch, count))
@@ -98,7 +92,6 @@ class ContactScene:
         """The same with half-planes that are further away by `gap` [m]."""
         planes = []
         for body, more in zip(self.terrains, gap.unbind(-1), strict=True):
-            assert isinstance(body, HalfPlane)
             offset = body.offset - more
             planes.append(HalfPlane(body.direction.expand(*offset.shape, 2), offset))
         return ContactScene(self.points_ee, tuple(planes), self.friction, self.compliance)
@@ -111,25 +104,9 @@ class ContactScene:
 
         planes = []
         for body in self.terrains:
-            assert isinstance(body, HalfPlane)
             planes.append(HalfPlane(pick(body.direction, -2), pick(body.offset, -1)))
         more = (pick(self.friction, -2), pick(self.compliance, -2))
         return ContactScene(pick(self.points_ee, -3), tuple(planes), *more)
-
-
-@dataclass(frozen=True)
-class ContactFrame:
-    """Chosen points against one terrain at a given pose, c contacts for each element.
-
-    `gap` [m]; `normal_row` and `tangent_row` are the derivatives of the gap and of the
-    tangential position with respect to the pose, so also the wrench of a unit force.
-    """
-
-    gap: Float[Tensor, "*batch c"]
-    normal_row: Float[Tensor, "*batch c 3"]
-    tangent_row: Float[Tensor, "*batch c 3"]
-    points_world: Float[Tensor, "*batch c 2"]
-    tangent: Float[Tensor, "*batch c 2"]
 
 
 def place_points(
@@ -163,7 +140,6 @@ def column_scene(scene: ContactScene) -> ContactScene:
     """The scenes of m particles with an axis for transitions after theirs: batch (m, 1)."""
     planes = []
     for body in scene.terrains:
-        assert isinstance(body, HalfPlane)
         planes.append(HalfPlane(body.direction[..., None, :], body.offset[..., None]))
     return ContactScene(
         scene.points_ee[..., None, :, :],
@@ -174,43 +150,8 @@ def column_scene(scene: ContactScene) -> ContactScene:
 
 
 def terrain_gaps(
-    points_ee: Float[Tensor, "*#batch p 2"],
-    terrains: tuple[Terrain, ...],
-    pose: Float[Tensor, "*#batch 3"],
-) -> tuple[Float[Tensor, "*batch2 t p"], Float[Tensor, "*batch2 t p"]]:
-    """Gap of every outline point to every terrain [m], and its derivative by the angle [m/rad]."""
-    points_world = transform_points(pose, points_ee)
-    turned = perpendicular(points_world - pose[..., None, :2])
-    gaps, levers = [], []
-    for body in terrains:
-        gaps.append(body.signed_distance(points_world))
-        levers.append((body.normal(points_world) * turned).sum(-1))
-    return torch.stack(gaps, dim=-2), torch.stack(levers, dim=-2)
-
-
-def contact_frame(
-    points_ee: Float[Tensor, "*batch p 2"],
-    terrain: Terrain,
-    pose: Float[Tensor, "*batch 3"],
-    index: Int[Tensor, "*batch c"],
-) -> ContactFrame:
-    """Gaps, frames and Jacobian rows of the points `index` against one terrain."""
-    chosen = torch.gather(points_ee, -2, index[..., None].expand(*index.shape, 2))
-    arm = rotate(pose[..., None, 2], chosen)
-    points_world = arm + pose[..., None, :2]
-    normal = terrain.normal(points_world)
-    # The normal points out of the terrain; the tangent completes a right-handed pair, so
-    # that on the floor it points along +x and on the wall along +z.
-    tangent = -perpendicular(normal)
-    return ContactFrame(
-        gap=terrain.signed_distance(points_world),
-        normal_row=_row(normal, arm),
-        tangent_row=_row(tangent, arm),
-        points_world=points_world,
-        tangent=tangent,
-    )
-
-
-def _row(direction: Tensor, arm: Tensor) -> Tensor:
-    moment = (direction * perpendicular(arm)).sum(-1, keepdim=True)
-    return torch.cat((direction, moment), dim=-1)
+    scene: ContactScene, pose: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch2 t p"]:
+    """Gap of every outline point to every terrain [m] at poses [m, m, rad]."""
+    points = transform_points(pose, scene.points_ee)
+    return torch.stack([body.signed_distance(points) for body in scene.terrains], dim=-2)

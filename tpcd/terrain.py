@@ -1,14 +1,8 @@
-"""The surroundings as signed distance and outward normal at points of the world.
-
-A terrain is anything with `signed_distance` (positive outside the terrain) and `normal`
-(unit, pointing out of it). Floor and wall are half-planes; curved terrain is another
-class with the same two functions. Parameters carry batch axes in front of the points.
-"""
+"""The surroundings as half-planes: floor, wall, and any that are tilted."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -16,29 +10,6 @@ from torch import Tensor
 
 OFF_UNIT = 2e-3
 """What the square of a direction's length may differ from 1, as of one rounded to three digits."""
-
-
-@runtime_checkable
-class Terrain(Protocol):
-    """A body of the world that the held object can touch."""
-
-    def signed_distance(
-        self, points_world: Float[Tensor, "*batch p 2"]
-    ) -> Float[Tensor, "*batch p"]:
-        """Distance from the surface [m], positive outside the terrain."""
-        ...
-
-    def normal(self, points_world: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p 2"]:
-        """Outward unit normal of the terrain at the surface point nearest to each point."""
-        ...
-
-    def double(self) -> Terrain:
-        """The same terrain in float64."""
-        ...
-
-    def gather(self, index: Int[Tensor, "*batch"]) -> Terrain:
-        """The terrains at positions `index` of the flattened batch."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -53,10 +24,6 @@ class HalfPlane:
     ) -> Float[Tensor, "*batch p"]:
         """Distance n·p - offset [m]."""
         return (points_world * self.direction[..., None, :]).sum(-1) - self.offset[..., None]
-
-    def normal(self, points_world: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p 2"]:
-        """The constant n, one for each point."""
-        return self.direction[..., None, :].expand(points_world.shape)
 
     def double(self) -> HalfPlane:
         """The same half-planes in float64."""

@@ -95,7 +95,7 @@ def _moves(
             scene, pose, command, stiffness, settings, previous=previous, unusual=True
         )
         good = found.status <= StepStatus.START_INSIDE
-        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, found.pose)
+        gaps = terrain_gaps(scene, found.pose)
         depth = -(gaps.amin(-1) + scene.compliance * found.contacts[..., 0]).amin(-1)
         wrong = torch.stack((depth, found.residual))[:, good].nan_to_num(math.inf).amax(-1)
         row = {"of": [law], "steps": ELEMENTS, "good": int(good.sum())}

@@ -229,7 +229,7 @@ def _inside(
             shape, replace(parameters, latent=parameters.latent.float())
         ).double()
         pose = episode.poses[0].expand(len(parameters.scale), 3)
-        gaps, _ = terrain_gaps(scene.points_ee, scene.terrains, pose)
+        gaps = terrain_gaps(scene, pose)
     shallowest, terrain = gaps.amin(-1).min(-1)
     best = int(shallowest.argmax())
     if bool((shallowest > -allowed).any()):

@@ -2,7 +2,6 @@
 
 from tpcd.simulator.record import (
     ContactMode,
-    ContactSet,
     StepSettings,
     StepStatus,
     Transition,
@@ -12,7 +11,6 @@ from tpcd.simulator.truth import QuasistaticTruth
 
 __all__ = [
     "ContactMode",
-    "ContactSet",
     "QuasistaticTruth",
     "StepSettings",
     "StepStatus",

@@ -1,8 +1,7 @@
 """What goes into a quasi-static step and what comes out of it.
 
-`StepSettings` are the choices of the simulator, `ContactSet` the contacts that carry load
-at the solution (at most three, as the plane has three degrees of freedom, and one more for each
-terrain where these yield) and `Transition` the answer for each element of the batch.
+`StepSettings` are the choices of the simulator and `Transition` the answer for each element of the
+batch.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.parameters import LARGEST_FRICTION
@@ -121,22 +120,6 @@ class StepSettings:
             )
         if not 0 < self.tolerance < math.inf:
             raise ValueError(f"tolerance is {self.tolerance}, expected a finite number > 0")
-
-
-@dataclass(frozen=True)
-class ContactSet:
-    """The contact rows that carry load, padded to k with multiplier 0: three, or where terrains
-    yield three and the number of terrains.
-
-    Row j says gap + side x friction x slip >= 0 for outline point `point` against terrain
-    `terrain`; `slipping` tells whether the point moves along the terrain.
-    """
-
-    multiplier: Float[Tensor, "*batch k"]
-    point: Int[Tensor, "*batch k"]
-    terrain: Int[Tensor, "*batch k"]
-    side: Float[Tensor, "*batch k"]
-    slipping: Bool[Tensor, "*batch k"]
 
 
 @dataclass(frozen=True)

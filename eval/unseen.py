@@ -167,8 +167,9 @@ def _cell(
     from tpcd.exploration import Estimator
     from tpcd.predict import ContactPredictor
     from tpcd.prediction import CHANNELS
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     generator = torch.Generator().manual_seed(1000 * seed + zlib.crc32(name.encode()) % 1000)
     scene = draw_scene(name, vertices, generator)

@@ -47,8 +47,8 @@ def check_recording(config: Check) -> int:
     Returns 0 where it is usable, 4 where it is with samples left out or in doubt, 5 where it is
     not usable as it is read, and 2 where it cannot be read.
     """
+    from tpcd.commands.check_file import check_file
     from tpcd.commands.check_rows import channel_rows
-    from tpcd.commands.checked import check_file
     from tpcd.commands.checking import plain_finding, write_check, written_page
     from tpcd.commands.verdict import verdict
     from tpcd.results import run_folder, write_results

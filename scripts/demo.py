@@ -78,8 +78,9 @@ def explore_and_test(config: Demo, folder: Path) -> None:
     from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.checkpoint import load_prior
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record, write_recording
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     outlines = builtin_outlines()
     if config.outline not in outlines:

@@ -51,8 +51,9 @@ def explore_object(config: Exploration) -> None:
     from tpcd.random import stream
     from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.named import find_outline
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import recording_contents
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     # Small tensor operations are fastest on one thread; the compiled loops have their own.
     torch.set_num_threads(1)

@@ -100,8 +100,9 @@ def plan_diagnosis(config: Planning) -> None:
 def _simulate(config: Planning, name: str) -> None:
     from tpcd.random import stream
     from tpcd.shape.named import find_outline
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record, write_recording
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     assert config.out is not None
     outline = find_outline(name)
@@ -193,8 +194,9 @@ def _complete(config: Planning) -> None:
     import sys
 
     from tpcd.discrepancy.checks import read_data
-    from tpcd.discrepancy.coverage import MOTIONS, coverage_of
+    from tpcd.discrepancy.coverage import coverage_of
     from tpcd.effects import CATALOGUE
+    from tpcd.effects.excitations import MOTIONS
     from tpcd.results import format_table
 
     data = read_data(config.after)

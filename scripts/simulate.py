@@ -184,8 +184,9 @@ def simulate(config: Simulation) -> None:
     from tpcd.random import stream
     from tpcd.shape.named import find_outline
     from tpcd.targets import check_target
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record, recording_contents
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
     from tpcd.versions import versions
 
     torch.set_num_threads(1)

@@ -49,8 +49,9 @@ def call(script: str, *arguments: str) -> int:
 def make_world(folder: Path) -> Path:
     """Put an exploration, a test episode, and the run that learnt from the first in a folder."""
     from tpcd.shape.builtin import builtin_outlines
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record, write_recording
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     generator = torch.Generator().manual_seed(11)
     outline = builtin_outlines()["jam_jar"]

@@ -18,8 +18,9 @@ from tpcd.effects import find_effect
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 CATALOGUE = tuple(find_effect(n) for n in ("floor_compliance", "wall_friction", "wall_tilt"))
 SETTINGS = DiagnosisSettings(

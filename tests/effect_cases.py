@@ -22,8 +22,9 @@ from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 DOCS = (ROOT / "tpcd" / "effects" / "README.md").read_text(encoding="utf-8")
 SHAPE = PolygonShape(builtin_outlines()["mug"])

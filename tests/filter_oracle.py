@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tpcd.belief.filter import FAR, OUTLIER_SQUARE, PASSES, HistoryLikelihood, Steps
+from tpcd.belief.filter import HistoryLikelihood, Steps
+from tpcd.belief.kernel_given import FAR, OUTLIER_SQUARE, PASSES
 from tpcd.belief.misfit import MisfitField, misfit_rows
 from tpcd.belief.setting import Setting
 from tpcd.contact import ContactScene

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from tpcd.discrepancy.coverage import NEEDED
 from tpcd.discrepancy.diagnosis import (
     Candidate,
     Cell,
@@ -14,6 +13,7 @@ from tpcd.discrepancy.diagnosis import (
     Limit,
     NamedEffect,
 )
+from tpcd.effects.excitations import NEEDED
 
 
 def a_gap(contact: str, rows: int) -> Gap:

@@ -55,8 +55,9 @@ def an_episode(steps: int = 30, seed: int = 3) -> Episode:
     """What a diagnosis motion leaves, without noise and without pauses, which a recording does
     not show as steps."""
     from tpcd.shape.builtin import builtin_outlines
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     generator = torch.Generator().manual_seed(seed)
     scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)

@@ -14,8 +14,9 @@ from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
 from tpcd.policies import ActiveSettings
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 SMALL = ActiveSettings(first=32, rounds=2, later=16, elite=4, particles=40, finalists=4)
 

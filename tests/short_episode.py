@@ -6,8 +6,9 @@ import torch
 
 from tpcd.data.episode import Episode
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 
 def short_episode(steps: int) -> Episode:

@@ -10,7 +10,7 @@ from filter_oracle import assimilate, first_state
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from tpcd.belief.filter import OUTLIER_SQUARE
+from tpcd.belief.kernel_given import OUTLIER_SQUARE
 
 STEPS, COEFFICIENTS = 4, 5
 

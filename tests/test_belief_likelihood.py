@@ -29,8 +29,9 @@ from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 FIELD = MisfitField(sd=1e-3, grain=0.2, roughness=15.0)
 

@@ -21,8 +21,9 @@ from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import simulate_step
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,9 @@ from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 STEPS = 8
 """With fewer, no change of contact is located on a path (see `walk`)."""

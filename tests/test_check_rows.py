@@ -13,8 +13,9 @@ from tpcd.data.checks import check_episode, repeated_readings
 from tpcd.data.episode import Episode
 from tpcd.quality.episode_rows import check_repeats
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 STATED = torch.tensor([2e-4, 2e-4, 2e-3, 0.3, 0.3, 0.02], dtype=torch.float64)
 

@@ -19,7 +19,8 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.simulator import batch, simulate_step
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.make import make_truth
+from tpcd.truth.scene import draw_scene
 
 compile_loops()
 loops = (batch.step_range, filtered.explain_range, mixture_kernel.sum_range, lay_range)

@@ -31,8 +31,9 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepStatus, rollout, simulate_step
 from tpcd.terrain import HalfPlane
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 POSE, COMMAND = [0.0, 0.12, 0.0], [0.01, 0.06, 0.0]
 

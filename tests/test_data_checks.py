@@ -164,13 +164,13 @@ def test_an_inverted_torque_is_told_with_the_angle_that_may_be_it():
     commands = torch.zeros(12, 3, dtype=torch.float64)
     commands[:, 1] = 0.05
     commands[1:, 1] = -0.03
-    commands[1:, 0] = torch.linspace(-0.02, 0.02, 11)
+    commands[1:, 0] = 0.04 * torch.rand(11, generator=generator, dtype=torch.float64) - 0.02
     commands[1:, 2] = 0.05
     stiffness = torch.tensor([100.0, 100.0, 50.0], dtype=torch.float64)
     # Pressed on a floor that lies 40 mm below the hand and 10 mm to its right, with friction.
     forces = torch.zeros(12, 2, dtype=torch.float64)
     forces[1:, 1] = 3.0 + torch.rand(11, generator=generator, dtype=torch.float64)
-    forces[1:, 0] = torch.linspace(-1.0, 1.0, 11)
+    forces[1:, 0] = 2.0 * torch.rand(11, generator=generator, dtype=torch.float64) - 1.0
     torque = 0.01 * forces[:, 1] + 0.04 * forces[:, 0]
     wrenches = torch.cat((forces, torque[:, None]), 1)
     episode = Episode(

@@ -14,8 +14,9 @@ from tpcd.data.files import read_episode, write_episode
 from tpcd.errors import EpisodeError
 from tpcd.quality.finding import Weight
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 
 @pytest.fixture(scope="module")

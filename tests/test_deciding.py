@@ -17,8 +17,9 @@ from tpcd.effects import find_effect
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 SAMPLER = SamplerSettings(
     rough=False, particles=100, draws=400, prior_draws=100, fresh_modes=12, modes=6, places=24

@@ -10,11 +10,12 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from tpcd.discrepancy.coverage import NEEDED, Coverage
+from tpcd.discrepancy.coverage import Coverage
 from tpcd.discrepancy.diagnosis import Limit
 from tpcd.discrepancy.limits import NOT_ALONE, detection_limits, told_limits
 from tpcd.discrepancy.screening import Glance
 from tpcd.effects import find_effect
+from tpcd.effects.excitations import NEEDED
 from tpcd.effects.protocol import EffectParameter
 
 LEAST = 6.0

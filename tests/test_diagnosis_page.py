@@ -24,18 +24,20 @@ from tpcd.commands.diagnosing import EXIT_CODES, compare_runs, write_diagnosis
 from tpcd.commands.diagnosis_figures import draw_diagnosis, shown_candidates
 from tpcd.commands.diagnosis_rows import shown_coverage, shown_tests
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.coverage import MOTIONS, NEEDED, coverage_of
+from tpcd.discrepancy.coverage import coverage_of
 from tpcd.discrepancy.diagnosis import Candidate, Diagnosis, NamedEffect, Verdict
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import posterior
 from tpcd.discrepancy.report_parts import given_effects, named_effects, theta_estimates
 from tpcd.discrepancy.variants import FINER_STEPS
 from tpcd.effects import find_effect
+from tpcd.effects.excitations import MOTIONS, NEEDED
 from tpcd.effects.model import load_model
 from tpcd.figures.sinks import save_figure
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 DOCS = (ROOT / "tpcd" / "discrepancy" / "README.md").read_text(encoding="utf-8")
 SAMPLER = replace(SETTINGS.sampler, flat_rounds=0)

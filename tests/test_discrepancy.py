@@ -17,7 +17,7 @@ from tpcd.belief.prior import make_prior
 from tpcd.data.episode import Episode
 from tpcd.discrepancy.adequacy import Adequacy
 from tpcd.discrepancy.conclude import Findings, conclude
-from tpcd.discrepancy.coverage import MOTIONS, NEEDED, contact_rows, coverage_of
+from tpcd.discrepancy.coverage import contact_rows, coverage_of
 from tpcd.discrepancy.diagnosis import Cell
 from tpcd.discrepancy.evidence import fit_model
 from tpcd.discrepancy.fit import FIT_SAMPLER, Fit, Question
@@ -32,13 +32,15 @@ from tpcd.effects import find_effect
 from tpcd.effects.check import check_effect
 from tpcd.effects.conditions import Conditions, Outcome, Rows
 from tpcd.effects.declare import DeclaredEffect
+from tpcd.effects.excitations import MOTIONS, NEEDED
 from tpcd.effects.protocol import EffectParameter
 from tpcd.errors import RunError
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import QuasistaticTruth, StepSettings
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 SMALL = DiagnosisSettings(
     sampler=replace(

@@ -25,8 +25,9 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import QuasistaticTruth, StepSettings
 from tpcd.terrain import floor, wall
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 STIFFNESS = torch.tensor([100.0, 100.0, 50.0], dtype=torch.float64)
 HALF = 0.05

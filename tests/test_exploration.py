@@ -29,8 +29,9 @@ from tpcd.robot.protocol import Robot
 from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import read_truth
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 SMALL = ActiveSettings(first=24, rounds=1, later=12, elite=4, particles=30, finalists=3)
 FAST = SamplerSettings(particles=80, draws=500, places=20, fresh_modes=20, prior_draws=300)

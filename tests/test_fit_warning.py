@@ -26,8 +26,9 @@ from tpcd.commands.plausibility import run_warnings
 from tpcd.commands.prediction import PredictedRows
 from tpcd.data import read_episode, write_episode
 from tpcd.files import read_json
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, read_truth, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 NOISE = torch.tensor([2e-4, 2e-4, 5e-4, 0.3, 0.3, 0.02], dtype=torch.float64)
 

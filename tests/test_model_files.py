@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from effect_cases import block, one_line
 
-from tpcd.discrepancy.coverage import NEEDED
 from tpcd.effects import CATALOGUE
+from tpcd.effects.excitations import NEEDED
 from tpcd.effects.model import Model, load_model, write_model
 from tpcd.effects.own import load_candidates, load_effects
 from tpcd.errors import ModelError

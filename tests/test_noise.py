@@ -19,8 +19,9 @@ from tpcd.effects import CATALOGUE
 from tpcd.errors import EpisodeError
 from tpcd.random import stream
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import DEFAULT_SENSOR_STD, make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 STD = np.array(DEFAULT_SENSOR_STD)
 SEEDS = range(4)

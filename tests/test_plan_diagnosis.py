@@ -16,7 +16,8 @@ from torch import Tensor
 from tpcd.cli import parse
 from tpcd.data import read_episode
 from tpcd.data.episode import Episode
-from tpcd.discrepancy.coverage import MOTIONS, coverage_of
+from tpcd.discrepancy.coverage import coverage_of
+from tpcd.effects.excitations import MOTIONS
 from tpcd.policies.basic import within
 from tpcd.policies.limits import Limits
 from tpcd.simulator import QuasistaticTruth

@@ -23,8 +23,9 @@ from tpcd.policies import (
 from tpcd.policies.basic import best_within
 from tpcd.predict import ContactPredictor
 from tpcd.robot.simulated import SimulatedRobot
+from tpcd.truth.make import make_truth
 from tpcd.truth.motions import press_and_slide, rich_exploration
-from tpcd.truth.scene import Scene, make_truth
+from tpcd.truth.scene import Scene
 
 belief = pytest.fixture(scope="module", name="belief")(can_belief)
 episode = pytest.fixture(scope="module", name="episode")(can_episode)

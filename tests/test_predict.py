@@ -20,8 +20,9 @@ from tpcd.planar import wrap_angle
 from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import Recording, make_motion, record
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,9 @@ from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import Recording, make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 SOFT = find_effect("floor_compliance", CATALOGUE)
 BIAS = find_effect("force_bias", CATALOGUE)

@@ -11,8 +11,9 @@ import torch
 from tpcd.data.episode import Episode
 from tpcd.quality.lever import depth_of_contact
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 OBJECTS = ("soup_can", "phone", "pear", "hammer", "mug", "cordless_drill")
 STD = (0.03, 0.03, 0.002)

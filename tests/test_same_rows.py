@@ -15,8 +15,9 @@ from tpcd.data.same_rows import copied_rows, row_marks, rows_among
 from tpcd.discrepancy.checks import read_data
 from tpcd.errors import EpisodeError
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import Recording, make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 
 def made(seed: int) -> Recording:

@@ -17,8 +17,9 @@ from tpcd.qp import ContactQP, QPSolution, solve
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.polygon import PolygonShape
 from tpcd.simulator import StepSettings, StepStatus, backends, simulate_step
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 ONCE = StepSettings(friction="anitescu", substeps=1)
 LAWS = pytest.mark.parametrize(

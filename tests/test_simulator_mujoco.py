@@ -17,8 +17,9 @@ from tpcd.planar import wrap_angle
 from tpcd.shape.builtin import make_entry
 from tpcd.shape.household import ENTRIES
 from tpcd.simulator import StepSettings, simulate_step
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 MEAN_FORCE = 0.02
 """Largest mean error of a force [N]."""

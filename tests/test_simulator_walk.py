@@ -28,9 +28,10 @@ from tpcd.simulator.path import (
     part_end,
     shorter_part,
 )
+from tpcd.truth.make import make_truth
 from tpcd.truth.mujoco_truth import MujocoSettings, MujocoTruth
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 FREE, STICK, RIGHT, LEFT = 0, 1, 2, 3
 OFF = 5e-5

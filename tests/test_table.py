@@ -94,7 +94,8 @@ def test_bootstrap_draws_whole_objects() -> None:
 def test_the_top_particles_are_those_of_the_largest_weights() -> None:
     from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.make import make_truth
+    from tpcd.truth.scene import draw_scene
 
     generator = torch.Generator().manual_seed(0)
     scene = draw_scene("mug", builtin_outlines()["mug"].vertices, generator)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from tpcd.discrepancy.coverage import NEEDED, coverage_of
+from tpcd.discrepancy.coverage import coverage_of
+from tpcd.effects.excitations import NEEDED
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.truth.diagnosis_motion import LOADS, diagnosis_motion
+from tpcd.truth.make import make_truth
 from tpcd.truth.motions import FORCE_LIMIT, LARGEST_TILT, History
 from tpcd.truth.recording import make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 OUTLINES = builtin_outlines()
 OBJECTS = ("mug", "book", "pear", "hammer")

@@ -19,6 +19,7 @@ from tpcd.data import check_episode, read_episode
 from tpcd.errors import EpisodeError
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.truth.make import make_truth
 from tpcd.truth.motions import FORCE_LIMIT, LARGEST_TILT, History, PlannedMotion, planned_test
 from tpcd.truth.recording import (
     check_truth,
@@ -27,7 +28,7 @@ from tpcd.truth.recording import (
     record,
     write_recording,
 )
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 SIMULATE = Path(__file__).parents[1] / "scripts" / "simulate.py"
 TOUCHING = 2e-4

@@ -25,8 +25,9 @@ def compile_loops() -> None:
     from tpcd.predict import ContactPredictor
     from tpcd.shape.builtin import builtin_outlines
     from tpcd.shape.polygon import PolygonShape
+    from tpcd.truth.make import make_truth
     from tpcd.truth.recording import make_motion, record
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.scene import draw_scene
 
     generator = torch.Generator().manual_seed(0)
     outline = builtin_outlines()["mug"]

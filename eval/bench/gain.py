@@ -211,7 +211,8 @@ def _situations(
     from tpcd.random import stream
     from tpcd.robot.simulated import SimulatedRobot
     from tpcd.shape.builtin import builtin_outlines
-    from tpcd.truth.scene import draw_scene, make_truth
+    from tpcd.truth.make import make_truth
+    from tpcd.truth.scene import draw_scene
 
     vertices = builtin_outlines()[config.outline].vertices
     scene = draw_scene(config.outline, vertices, stream(config.seed, scene_number))

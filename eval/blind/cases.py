@@ -128,7 +128,7 @@ def record_case(world: World, case: Case, seed: int, fresh: bool = False) -> Rec
 
 def make_hidden_truth(world: World, kind: str, steps: int) -> Truth:
     """A source of data of a world for a run of so many steps."""
-    from tpcd.truth.scene import make_truth
+    from tpcd.truth.make import make_truth
 
     return make_truth(world.scene, kind, world.hidden, steps)
 

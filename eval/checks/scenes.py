@@ -19,8 +19,9 @@ from tpcd.predict import ContactPredictor
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.shape.checkpoint import load_prior
 from tpcd.simulator import StepSettings, StepStatus, simulate_step
+from tpcd.truth.make import make_truth
 from tpcd.truth.recording import Policy, make_motion, record
-from tpcd.truth.scene import draw_scene, make_truth
+from tpcd.truth.scene import draw_scene
 
 PRIOR, PARTICLES, LEARNT, TESTED = "ycb21-z2", 100, 6, 20
 OBJECTS = ("jam_jar", "soup_can", "milk_carton", "wine_bottle", "mug")

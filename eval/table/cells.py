@@ -25,9 +25,10 @@ from tpcd.random import stream
 from tpcd.robot.simulated import SimulatedRobot
 from tpcd.shape.checkpoint import load_prior
 from tpcd.shape.protocol import Shape
+from tpcd.truth.make import make_truth
 from tpcd.truth.protocol import Truth
 from tpcd.truth.recording import Recording, make_motion, record
-from tpcd.truth.scene import Scene, draw_scene, make_truth
+from tpcd.truth.scene import Scene, draw_scene
 
 CHECKPOINTS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30)
 """Numbers of moves after which the predictions are tested."""

@@ -39,6 +39,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tpcd.belief.kernel_given import FAR, OUTLIER_SQUARE
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import Setting
 from tpcd.simulator import StepSettings
@@ -48,16 +49,6 @@ from tpcd.threads import in_parts
 if TYPE_CHECKING:
     from tpcd.belief.kernel_given import SceneSlopes
     from tpcd.simulator.workspace import Law, Tape
-
-OUTLIER_SQUARE = 16.3
-"""Squared Mahalanobis distance (3 degrees of freedom, 0.1 %) from which a transition counts
-as not explained: its covariance grows so that it stays at this distance."""
-
-PASSES = 3
-"""Times at most that a transition is stepped and brought in: the third is the first again, where
-the second explains less."""
-FAR = 3e-4
-"""Change of a gap [m] by which a transition is stepped again: about its reading's noise."""
 
 
 @dataclass(frozen=True)

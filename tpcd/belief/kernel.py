@@ -13,9 +13,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from tpcd.belief import filter, kernel_filter, kernel_given, kernel_state
-from tpcd.belief.filter import PASSES
+from tpcd.belief import kernel_filter, kernel_given, kernel_state
 from tpcd.belief.kernel_filter import assimilate, by_scene, follow
+from tpcd.belief.kernel_given import PASSES
 from tpcd.belief.kernel_state import (
     begin,
     copy_state,
@@ -268,7 +268,7 @@ def _keep(found, answer, i, k):
 
 
 explain_range = _compile_explain_range(
-    source_stamp(sys.modules[__name__], filter, kernel_filter, kernel_given, kernel_state)
+    source_stamp(sys.modules[__name__], kernel_filter, kernel_given, kernel_state)
 )
 """Evaluate the particles `which[first:last]`: (points, law, given, measured, by_theta, found,
 tape, which, first, last).

@@ -6,6 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+OUTLIER_SQUARE = 16.3
+"""Squared Mahalanobis distance (3 degrees of freedom, 0.1 %) from which a transition counts
+as not explained: its covariance grows so that it stays at this distance."""
+
+PASSES = 3
+"""Times at most that a transition is stepped and brought in: the third is the first again, where
+the second explains less."""
+FAR = 3e-4
+"""Change of a gap [m] by which a transition is stepped again: about its reading's noise."""
+
 
 class Measured(NamedTuple):
     """What is known and asked of m particles over n transitions between r = n + 1 rows.

@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from tpcd.belief.decoding import outlines
 from tpcd.belief.filter import HistoryLikelihood, Steps, filter_history, joined
 from tpcd.belief.free_start import free_starts, start_gaps
 from tpcd.belief.history import History
@@ -37,7 +38,6 @@ from tpcd.effects.conditions import Outcome
 from tpcd.effects.protocol import Added, Effect, parts_of
 from tpcd.effects.simulate import outcome_in_parts
 from tpcd.parameters import Parameters
-from tpcd.shape.decoding import outlines
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 

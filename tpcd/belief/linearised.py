@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.belief.decoding import decode
 from tpcd.belief.filter import HistoryLikelihood, filter_history
 from tpcd.belief.history import History
 from tpcd.belief.likelihood import effective_setting
@@ -18,7 +19,6 @@ from tpcd.contact import place_points, scene_from_parameters
 from tpcd.effects.conditions import Outcome
 from tpcd.effects.protocol import Added
 from tpcd.parameters import Parameters
-from tpcd.shape.decoding import decode
 from tpcd.shape.protocol import Shape
 from tpcd.simulator import StepSettings
 

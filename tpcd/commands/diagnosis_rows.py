@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from tpcd.discrepancy.coverage import MOTIONS, NEEDED, UNITS, Coverage
+from tpcd.discrepancy.coverage import Coverage
+from tpcd.effects.excitations import MOTIONS, NEEDED, UNITS
 from tpcd.figures.style import display_unit
 
 TESTS: dict[str, tuple[str, str]] = {

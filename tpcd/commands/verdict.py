@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from tpcd.commands.checked import LEAST_USABLE, Checked
+from tpcd.commands.check_file import LEAST_USABLE
+from tpcd.commands.checked import Checked
 from tpcd.quality.finding import Finding, Weight
 
 USABLE, IN_PART, NOT_USABLE = 0, 4, 5

@@ -165,8 +165,11 @@ def check_noise(episode: Episode) -> list[str]:
 def _coarse(episode: Episode) -> list[str]:
     """Sentences on channels that were rounded to steps of which the stated noise does not know."""
     found = []
+    targets = np.column_stack((episode.commands.numpy(), np.zeros((len(episode), 3))))
     for k, name in enumerate(SENSOR_NAMES):
-        column, stated = _readings(episode)[1:, k], float(episode.sensor_std[k])
+        column, stated = _readings(episode)[:, k], float(episode.sensor_std[k])
+        # Where the arm stands as asked, the steps may be those of the commands.
+        column = column[column != targets[:, k]]
         if len(np.unique(column)) < FEWEST_LEVELS or not stated > 0:
             continue
         step = grid_step(column)

@@ -20,8 +20,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tpcd.belief.filter import OUTLIER_SQUARE, filter_history
+from tpcd.belief.filter import filter_history
 from tpcd.belief.history import History
+from tpcd.belief.kernel_given import OUTLIER_SQUARE
 from tpcd.belief.likelihood import effective_setting, outcome_of
 from tpcd.contact import scene_from_parameters
 from tpcd.discrepancy.diagnosis import CHANNELS, Cell

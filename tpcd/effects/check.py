@@ -12,8 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tpcd.discrepancy.coverage import NEEDED
 from tpcd.effects.conditions import Conditions, Outcome, Rows, bare_conditions, sequence
+from tpcd.effects.excitations import NEEDED
 from tpcd.effects.guard import FIELDS
 from tpcd.effects.protocol import Added, Effect, EffectParameter, parameter_bounds
 from tpcd.errors import EffectError

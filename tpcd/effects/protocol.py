@@ -95,7 +95,7 @@ class Effect(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the excitations (`discrepancy.coverage`) without which it is hardly seen."""
+        """Names of the excitations (`effects.excitations`) without which it is hardly seen."""
         ...
 
     def apply(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,7 +16,6 @@ from torch import Tensor
 
 from tpcd.parameters import DEFAULT_BOUNDS, LARGEST_FRICTION, SCENE_NAMES
 from tpcd.planar import transform_points
-from tpcd.truth.protocol import Truth
 
 DEFAULT_STIFFNESS = (100.0, 100.0, 50.0)
 START_HEIGHTS = (0.010, 0.020)
@@ -135,52 +133,3 @@ def draw_scene(
         start_pose=torch.tensor(start_pose, dtype=torch.float64),
         stiffness=torch.tensor(stiffness, dtype=torch.float64),
     )
-
-
-def make_truth(
-    scene: Scene,
-    kind: Literal["mujoco", "quasistatic"],
-    hidden: Mapping[str, Mapping[str, float]] | None = None,
-    steps: int = 1,
-) -> Truth:
-    """The truth of a scene at its start pose; raises `SolverError` where mujoco is missing.
-
-    `hidden` are effects with their parameters in SI units, for a run of so many steps; readings
-    then include what they do to the sensors. Raises ValueError for unknown ones.
-    """
-    if hidden:
-        return _with_effects(scene, kind, hidden, steps)
-    if kind == "mujoco":
-        from tpcd.truth.mujoco_truth import MujocoTruth as TruthKind
-    elif kind == "quasistatic":
-        from tpcd.simulator import QuasistaticTruth as TruthKind
-    else:
-        raise ValueError(f"truth is {kind!r}, expected 'mujoco' or 'quasistatic'")
-    truth = TruthKind(
-        scene.vertices_ee, scene.friction, scene.floor_height, scene.wall_position, scene.stiffness
-    )
-    truth.reset(scene.start_pose)
-    return truth
-
-
-def _with_effects(
-    scene: Scene, kind: str, hidden: Mapping[str, Mapping[str, float]], steps: int
-) -> Truth:
-    if kind == "mujoco":
-        from tpcd.truth.injected import InjectedMujocoTruth
-
-        truth: Truth = InjectedMujocoTruth(scene, hidden, steps)
-    else:
-        from tpcd.effects.truth import EffectTruth, added_effects
-
-        truth = EffectTruth(
-            scene.vertices_ee,
-            scene.friction,
-            scene.floor_height,
-            scene.wall_position,
-            scene.stiffness,
-            added_effects(hidden),
-            steps,
-        )
-    truth.reset(scene.start_pose)
-    return truth

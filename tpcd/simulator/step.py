@@ -81,9 +81,11 @@ def simulate_step(
         found = Answered(*(torch.cat(both)[back] for both in zip(*parts, strict=True)))
     turn = asked.start[:, 2] + wrap_angle(asked.command[:, 2] - asked.start[:, 2])
     away = found.pose - torch.cat((asked.command[:, :2], turn[:, None]), dim=-1)
-    # What has no answer touches no gradient of the others, with which it shares inputs.
+    wrench = asked.stiffness * away
     invalid = (found.status == int(StepStatus.INVALID_INPUT))[:, None]
-    wrench = (asked.stiffness * away.masked_fill(invalid, 0.0)).masked_fill(invalid, torch.nan)
+    if bool(invalid.any()):
+        # What has no answer touches no gradient of the others, with which it shares inputs.
+        wrench = (asked.stiffness * away.masked_fill(invalid, 0.0)).masked_fill(invalid, torch.nan)
     terrains = len(scene.terrains)
     values = {
         "pose": (torch.cat((found.pose[:, :2], wrap_angle(found.pose[:, 2:])), dim=-1), (3,)),

@@ -269,10 +269,11 @@ def append_further(
     turn = (math.cos(pose[2]), math.sin(pose[2]))
     landed = (math.cos(landing[2]), math.sin(landing[2]))
     for t in range(terrains):
-        _clear(space)
-        if not relaxed:
+        direct = nothing
+        if space.load[t] > 0.0 and not relaxed:
+            _clear(space)
             _by_friction(world, o, law, t, turn, pose, space)
-        direct = _direct(world, o, event, 0.0, pose, space, slopes.rate)
+            direct = _direct(world, o, event, 0.0, pose, space, slopes.rate)
         _string_row(slopes, further, t, direct, 0.0, 0, 0.0, 0)
     if slopes.inputs > terrains:
         for t in range(terrains):

@@ -18,7 +18,7 @@ RUNTIME = (
 """Modules that know nothing of the problem, or only its units and names; they carry all rooms."""
 LAYERS = (
     RUNTIME,
-    "qp shape quality figures",
+    "geometry qp shape quality figures",
     "contact data",
     "simulator logs",
     "effects identification",

@@ -22,7 +22,7 @@ from typing import Any, no_type_check
 
 from numba import njit
 from numba.core import config
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 from tpcd import __version__
@@ -100,7 +100,22 @@ def _find_place() -> None:
             _copy_loops(beside, place)
 
 
+def _forgive_renamed_modules() -> None:
+    """Let what was kept with types of modules that are gone be compiled anew, as after an update;
+    numba would end in an ImportError."""
+    load = IndexDataCacheFile._load_index
+
+    def load_or_forget(self: IndexDataCacheFile) -> dict:
+        try:
+            return load(self)
+        except (ImportError, AttributeError):
+            return {}
+
+    IndexDataCacheFile._load_index = load_or_forget  # type: ignore[method-assign]
+
+
 _find_place()
+_forgive_renamed_modules()
 inner: Callable[..., Any] = partial(
     njit, _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
 )

@@ -42,6 +42,7 @@ from torch import Tensor
 from tpcd.belief.kernel_given import FAR, OUTLIER_SQUARE
 from tpcd.belief.misfit import MisfitField
 from tpcd.belief.setting import Setting
+from tpcd.geometry.surfaces import HalfPlanes
 from tpcd.simulator import StepSettings
 from tpcd.simulator.engine import law_of
 from tpcd.threads import in_parts
@@ -131,20 +132,17 @@ def filter_history(
     rest = torch.cat((rest, rest.new_zeros(len(rest), 1)), dim=1)
     if least is None:
         least = misfit_sd.new_full((count,), -torch.inf)
+    normal, offset, friction, compliance = _alike(
+        conditions.normal, conditions.offset_seen, conditions.friction, conditions.compliance
+    )
+    planes = (normal.flatten(0, 1), offset.flatten(0, 1))
     given = Given(
         *(
             value.contiguous().numpy()
             for value in _alike(conditions.target, conditions.stiffness, conditions.turn)
         ),
-        *(
-            value.contiguous().numpy()
-            for value in _alike(
-                conditions.normal,
-                conditions.offset_seen,
-                conditions.friction,
-                conditions.compliance,
-            )
-        ),
+        HalfPlanes(*(value.contiguous().numpy() for value in planes)),
+        *(value.contiguous().numpy() for value in (friction, compliance)),
         (conditions.warp if conditions.warps else conditions.warp[:, :, :0])
         .mT.contiguous()
         .numpy(),

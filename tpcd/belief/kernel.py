@@ -24,10 +24,11 @@ from tpcd.belief.kernel_state import (
     new_filter,
     pass_over,
 )
+from tpcd.geometry.candidates import World, frame, nearest, new_chains
+from tpcd.geometry.query import meet, own_surfaces
 from tpcd.loops import inner, njit
 from tpcd.simulator.batch import source_stamp
 from tpcd.simulator.element import step_element
-from tpcd.simulator.geometry import World, new_chains
 from tpcd.simulator.request import (
     Answer,
     Request,
@@ -58,7 +59,7 @@ def _compile_explain_range(stamp: int) -> Callable[..., None]:
 def _explain_range(points, law, given, measured, by_theta, found, tape, which, first, last):
     """Evaluate the particles in `which` from `first` up to `last`; `points` (m, 2, p) are the
     outlines of all."""
-    terrains, count = given.offsets.shape[2], points.shape[2]
+    terrains, count = given.friction.shape[2], points.shape[2]
     steps, size = measured.used.shape[0], found.mean.shape[1]
     entries = by_theta.offsets.shape[1]
     chains, space = new_chains(terrains, count), new_space(terrains, law.room, tape.motion.shape[1])
@@ -95,8 +96,15 @@ def _explain_range(points, law, given, measured, by_theta, found, tape, which, f
         given.largest_turn,
         given.follow_path,
     )
-    normals, offsets, friction, compliance = new_planes(terrains)
-    here = World(np.zeros((1, 2, count)), normals, offsets, friction, compliance)
+    where, clearance, friction, compliance = new_planes(terrains)
+    here = World(
+        np.zeros((1, 2, count)),
+        own_surfaces(given.surfaces),
+        where,
+        clearance,
+        friction,
+        compliance,
+    )
     law = own_law(law)
     for i in which[first:last]:
         if not begin_recall(space, tape, i):
@@ -145,7 +153,7 @@ def _explain_range(points, law, given, measured, by_theta, found, tape, which, f
             for again in range(PASSES):
                 _meet(here, given, i, k + 1)
                 for t in range(terrains):
-                    here.offsets[0, t] -= state.gap[t]
+                    here.clearance[0, t] = state.gap[t]
                 step_element(here, 0, chains, law, extent, request, k, answer, space, slopes, poses)
                 if answer.statuses[k] == WANTED:
                     break
@@ -156,7 +164,9 @@ def _explain_range(points, law, given, measured, by_theta, found, tape, which, f
                 if again == 0 and math.isfinite(term):
                     explained, first_term = is_explained(state, measured), term
                     far = expect_gap(state, measured, k) > measured.far
-                    stopped = not explained and _stop(here, answer, measured, seen, k, ends, state)
+                    stopped = not explained and _stop(
+                        here, chains, answer, measured, seen, k, ends, state
+                    )
                     if not far and not stopped:
                         break
                 elif again == 1 and (
@@ -217,40 +227,38 @@ def _hold(here, points, given, i, row):
 @inner
 @no_type_check
 def _meet(here, given, i, row):
-    """Take over the planes of a particle at a row."""
-    each, rows = given.offsets.shape[0] > 1, given.offsets.shape[1] > 1
-    p, r = i if each else 0, row if rows else 0
-    for t in range(given.offsets.shape[2]):
-        here.normals[0, t, 0] = given.normals[p, r, t, 0]
-        here.normals[0, t, 1] = given.normals[p, r, t, 1]
-        here.offsets[0, t], here.friction[0, t] = given.offsets[p, r, t], given.friction[p, r, t]
+    """Take over the surfaces of a particle at a row, where theta has them."""
+    each, rows = given.friction.shape[0] > 1, given.friction.shape[1]
+    p, r = i if each else 0, row if rows > 1 else 0
+    meet(here.surfaces, given.surfaces, here.where, p * rows + r)
+    for t in range(given.friction.shape[2]):
+        here.clearance[0, t] = 0.0
+        here.friction[0, t] = given.friction[p, r, t]
         here.compliance[0, t] = given.compliance[p, r, t]
 
 
 @inner
 @no_type_check
-def _stop(here, answer, measured, seen, k, ends, state):
+def _stop(here, chains, answer, measured, seen, k, ends, state):
     """Let terrains that were not touched, but before which the object was held back, be touched at
     the pose that was read; whether there are any."""
     found = False
     angle = measured.poses[seen, k + 1, 2] + ends - measured.give[seen, k + 1, 2]
     x = measured.poses[seen, k + 1, 0] - measured.give[seen, k + 1, 0]
     z = measured.poses[seen, k + 1, 1] - measured.give[seen, k + 1, 1]
-    c, s = math.cos(angle), math.sin(angle)
+    turn = (math.cos(angle), math.sin(angle))
     for t in range(answer.modes.shape[1]):
-        u, v = here.normals[0, t, 0], here.normals[0, t, 1]
+        gap, p = nearest(here, 0, chains, t, (x, z), turn)
+        _, u, v, _, _, _ = frame(
+            here, 0, t, here.points[0, 0, p], here.points[0, 1, p], (x, z), turn
+        )
         held = u * (measured.poses[seen, k + 1, 0] - answer.poses[k, 0])
         held += v * (measured.poses[seen, k + 1, 1] - answer.poses[k, 1])
         if answer.modes[k, t] != 0 or not held > measured.far:
             continue
-        along, across = u * c + v * s, v * c - u * s
-        nearest = np.inf
-        for p in range(here.points.shape[2]):
-            height = along * here.points[0, 0, p] + across * here.points[0, 1, p]
-            nearest = min(nearest, height)
-        nearest += u * x + v * z - here.offsets[0, t] - state.gap_before[t]
-        if nearest > -state.gap[t]:
-            state.gap[t] = -nearest
+        gap -= state.gap_before[t]
+        if gap > -state.gap[t]:
+            state.gap[t] = -gap
             found = True
     return found
 

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tpcd.geometry.surfaces import HalfPlanes, SurfaceTable
+
 OUTLIER_SQUARE = 16.3
 """Squared Mahalanobis distance (3 degrees of freedom, 0.1 %) from which a transition counts
 as not explained: its covariance grows so that it stays at this distance."""
@@ -47,15 +49,14 @@ class Given(NamedTuple):
     """What the arm is asked and what it meets, for m particles and r rows, or 1 of either.
 
     `commands` and `stiffness` (.., .., 3); `turns` (.., .., 1) the angle of the object in the
-    hand besides its mount; planes `normals` (.., .., t, 2), `offsets`, `friction` and
+    hand besides its mount; `surfaces` a table of as many environments, row by row, `friction` and
     `compliance` (.., .., t). `warp` (.., .., 2, p) moves the outline of a row, p = 0 where none is.
     """
 
     commands: np.ndarray
     stiffness: np.ndarray
     turns: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
+    surfaces: HalfPlanes | SurfaceTable
     friction: np.ndarray
     compliance: np.ndarray
     warp: np.ndarray

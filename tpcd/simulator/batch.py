@@ -15,12 +15,14 @@ from typing import no_type_check
 import numpy as np
 
 from tpcd import loops, parameters, terrain
+from tpcd.geometry import candidates, query, surfaces
+from tpcd.geometry.candidates import World, new_chains
+from tpcd.geometry.query import own_surfaces
 from tpcd.loops import njit
 from tpcd.qp import active_set, elastic, problem
 from tpcd.simulator import (
     element,
     events,
-    geometry,
     path,
     record,
     request,
@@ -32,14 +34,13 @@ from tpcd.simulator import (
     workspace,
 )
 from tpcd.simulator.element import step_element
-from tpcd.simulator.geometry import World, new_chains
 from tpcd.simulator.request import new_planes, own_law, prepare, set_planes, set_stiffness
 from tpcd.simulator.tangents import BY_ALL, NOTHING_MORE, new_slopes
 from tpcd.simulator.workspace import begin_recall, end_recall, new_space
 
 _SOURCES = (
-    active_set, elastic, element, events, geometry, loops, parameters, path, problem, record,
-    request, residual, response, rest, tangents, terrain, wedging, workspace,
+    active_set, candidates, elastic, element, events, loops, parameters, path, problem, query,
+    record, request, residual, response, rest, surfaces, tangents, terrain, wedging, workspace,
 )  # fmt: skip
 """What is compiled here, and where its constants are from."""
 
@@ -72,12 +73,13 @@ def _compile_step_range(stamp: int) -> Callable[..., None]:
 @no_type_check
 def _step_range(world, law, asked, answer, tape, first, last):
     """Step the transitions from `first` up to `last`."""
-    terrains, count = world.normals.shape[1], world.points.shape[2]
+    terrains, count = world.friction.shape[1], world.points.shape[2]
     chains, space = new_chains(terrains, count), new_space(terrains, law.room, tape.motion.shape[1])
     level = BY_ALL if answer.from_inputs.shape[1] > 0 else NOTHING_MORE
     slopes = new_slopes(terrains, count, level, law.room)
     poses = np.zeros((7, 3))
-    normals, offsets, friction, compliance = new_planes(terrains)
+    where, clearance, friction, compliance = new_planes(terrains)
+    own = own_surfaces(world.surfaces)
     law = own_law(law)
     b = first
     while b < last:
@@ -85,7 +87,7 @@ def _step_range(world, law, asked, answer, tape, first, last):
         o, end = asked.owner[b], b + 1
         while end < last and asked.owner[end] == o:
             end += 1
-        here = World(world.points[o : o + 1], normals, offsets, friction, compliance)
+        here = World(world.points[o : o + 1], own, where, clearance, friction, compliance)
         set_planes(here, world, asked.place[b])
         extent = prepare(here, 0, law, asked, b, end, chains)
         for i in range(b, end):

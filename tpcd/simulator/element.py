@@ -12,9 +12,9 @@ from typing import no_type_check
 
 import numpy as np
 
+from tpcd.geometry.candidates import first_touch, touching
 from tpcd.loops import inner
 from tpcd.simulator.events import NOTHING, next_event, respond_until
-from tpcd.simulator.geometry import first_touch, touching
 from tpcd.simulator.path import (
     AIM,
     ALMOST,
@@ -77,7 +77,7 @@ def step_element(
     """
     start, before, command, part = poses[0], poses[1], poses[2], poses[3]
     landing, pose, kept_pose = poses[4], poses[5], poses[6]
-    whole, terrains = slopes.whole, world.normals.shape[1]
+    whole, terrains = slopes.whole, world.friction.shape[1]
     height = 3 + 2 * terrains
     finite = math.isfinite(extent) and sound(world, o, law)
     for a in range(3):
@@ -138,7 +138,7 @@ def step_element(
                     load += space.multiplier[j]
                 if attempt == PLAIN:
                     first, most = ended, load
-                    if not may_wedge(world, o, law, pose, space, ended) and ended != RELAXED:
+                    if not may_wedge(world, o, law, space, ended) and ended != RELAXED:
                         break
                 following = _after(attempt, first, ended, law.coulomb, load < LIGHTER * most)
                 if following == attempt:
@@ -199,10 +199,11 @@ def step_element(
                 else:
                     event = NOTHING
             append_part(slopes, follows)
-            append_further(
-                world, o, law, relaxed, (point, terrain), event, landing, part, share, rested,
-                pose, space, slopes,
-            )  # fmt: skip
+            if slopes.inputs > 0:
+                append_further(
+                    world, o, law, relaxed, (point, terrain), event, landing, part, share, rested,
+                    pose, space, slopes,
+                )  # fmt: skip
             if jammed:
                 # What yields to everything has no derivative.
                 whole[:] = 0.0
@@ -297,7 +298,7 @@ def _restore(slopes, pose, kept_pose, height):
         pose[a] = kept_pose[a]
 
 
-@inner(error_model="numpy")
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def _contacts(world, o, pose, space, contacts, b):
     """Forces of each terrain and the arm of their point, weighted by load."""

@@ -61,9 +61,10 @@ def step(
     given: rows by friction (t), compliance (t), angle of the normal (t), stiffness (3), command
     before (3) and command (3), and by the outline points. A backend other than `native` works on
     the `device` (None: the CPU)."""
+    from tpcd.geometry.candidates import World
+    from tpcd.geometry.surfaces import HalfPlanes
     from tpcd.simulator.backends import solved_by
     from tpcd.simulator.batch import step_range
-    from tpcd.simulator.geometry import World
     from tpcd.simulator.request import Answer, Request
 
     count, terrains = len(asked.start), asked.offsets.shape[-1]
@@ -80,9 +81,14 @@ def step(
         from_inputs=torch.empty(count, inputs, 3, dtype=torch.float64),
         from_points=torch.empty(count, points, 2, 3, dtype=torch.float64),
     )
-    planes = (asked.normals, asked.offsets, asked.friction, asked.compliance)
-    outlines = asked.points.detach().mT.contiguous().numpy()
-    world = World(outlines, *(_array(value) for value in planes))
+    world = World(
+        asked.points.detach().mT.contiguous().numpy(),
+        HalfPlanes(_array(asked.normals), _array(asked.offsets)),
+        np.zeros(1, np.int64),
+        np.zeros((1, terrains)),
+        _array(asked.friction),
+        _array(asked.compliance),
+    )
     yields = bool((asked.compliance[asked.scene] != 0).any())
     law = law_of(settings, terrains if yields else 0)
     request = Request(

@@ -17,8 +17,8 @@ from typing import no_type_check
 
 import numpy as np
 
+from tpcd.geometry.candidates import frame, nearest
 from tpcd.loops import inner
-from tpcd.simulator.geometry import lowest_point, object_normal
 from tpcd.simulator.response import respond
 
 SLOWEST = 1e-3
@@ -54,17 +54,18 @@ def next_event(world, o, chains, law, before, command, pose, space, rate):
         if space.chosen[j, 0] >= 0 and slope < -SLOWEST * margin and margin < -slope * ahead:
             ahead, which, inverse = -margin / slope, j, -1.0 / slope
     turn = (math.cos(pose[2]), math.sin(pose[2]))
-    for t in range(world.normals.shape[1]):
+    for t in range(world.friction.shape[1]):
         touched = False
         for j in range(k):
             touched = touched or space.chosen[j, 0] >= 0 and space.chosen[j, 1] == t
         if touched:
             continue
-        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        low, lowest = lowest_point(world, o, chains, t, u, v)
-        margin = max(low + nx * pose[0] + nz * pose[1] - world.offsets[o, t], 0.0)
-        across = v * world.points[o, 0, lowest] - u * world.points[o, 1, lowest]
+        gap, lowest = nearest(world, o, chains, t, (pose[0], pose[1]), turn)
+        margin = max(gap, 0.0)
+        _, nx, nz, _, across, _ = frame(
+            world, o, t, world.points[o, 0, lowest], world.points[o, 1, lowest],
+            (pose[0], pose[1]), turn,
+        )  # fmt: skip
         slope = nx * rate[0] + nz * rate[1] + across * rate[2]
         if slope < -SLOWEST * margin and margin < -slope * ahead:
             ahead, which, point, inverse = -margin / slope, k + t, lowest, -1.0 / slope
@@ -91,7 +92,7 @@ def respond_until(world, o, law, event, pose, space, slopes):
             for i in range(k):
                 share = system.inverse[which, i]
                 by_start -= share * system.starts[i, c]
-                by_command -= share * system.rows[i, c] * system.soft[c] * law.stiffness[c]
+                by_command -= share * system.left[i, c] * law.stiffness[c]
         for a in range(3):
             response[a, c] += slopes.rate[a] * inverse * by_start
             response[3 + a, c] += slopes.rate[a] * inverse * by_command
@@ -106,7 +107,7 @@ def respond_until(world, o, law, event, pose, space, slopes):
                 share = system.inverse[which, i]
                 if space.chosen[i, 0] >= 0 and space.chosen[i, 1] == t:
                     by_gap -= share
-                by_lever -= share * system.rows[i, 2] * system.soft[2] * space.load[t]
+                by_lever -= share * system.left[i, 2] * space.load[t]
         for a in range(3):
             by_terrain[t, a] += slopes.rate[a] * inverse * by_gap
             by_terrain[terrains + t, a] += slopes.rate[a] * inverse * by_lever
@@ -116,6 +117,7 @@ def respond_until(world, o, law, event, pose, space, slopes):
 @no_type_check
 def touch_row(world, o, t, point, pose, row):
     """How the gap of a point to terrain t moves with the pose."""
-    u, v = object_normal(world, o, t, math.cos(pose[2]), math.sin(pose[2]))
-    row[0], row[1] = world.normals[o, t, 0], world.normals[o, t, 1]
-    row[2] = v * world.points[o, 0, point] - u * world.points[o, 1, point]
+    _, row[0], row[1], _, row[2], _ = frame(
+        world, o, t, world.points[o, 0, point], world.points[o, 1, point], (pose[0], pose[1]),
+        (math.cos(pose[2]), math.sin(pose[2])),
+    )  # fmt: skip

@@ -127,7 +127,7 @@ def sticking(mask, terrains):
     return modes
 
 
-@njit(_nrt=False)
+@njit(_nrt=False, forceinline=True)
 @no_type_check
 def contact_modes(space, terrains):
     """Contact modes, two bits for each terrain, from the row that carries its largest load."""

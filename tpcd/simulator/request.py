@@ -7,9 +7,10 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
+from tpcd.geometry.candidates import build_chains
+from tpcd.geometry.query import meet, plane_of, spread
 from tpcd.loops import inner
 from tpcd.parameters import LARGEST_FRICTION
-from tpcd.simulator.geometry import build_chains
 from tpcd.simulator.rest import PROBE_ANGLE
 from tpcd.simulator.workspace import Law
 from tpcd.terrain import OFF_UNIT
@@ -59,9 +60,10 @@ class Answer(NamedTuple):
 @inner(_nrt=True)
 @no_type_check
 def new_planes(terrains):
-    """Room for the planes of one transition."""
+    """Room for what one transition meets: where its surfaces are in their table, how much further
+    away they are, friction and compliance."""
     flat = (1, terrains)
-    return np.zeros((1, terrains, 2)), np.zeros(flat), np.zeros(flat), np.zeros(flat)
+    return np.zeros(1, np.int64), np.zeros(flat), np.zeros(flat), np.zeros(flat)
 
 
 @inner(_nrt=True)
@@ -74,11 +76,10 @@ def own_law(law):
 @inner
 @no_type_check
 def set_planes(here, world, place):
-    """Take over the planes at a place of the world."""
-    for t in range(here.offsets.shape[1]):
-        here.normals[0, t, 0] = world.normals[place, t, 0]
-        here.normals[0, t, 1] = world.normals[place, t, 1]
-        here.offsets[0, t], here.friction[0, t] = world.offsets[place, t], world.friction[place, t]
+    """Take over the surfaces at a place of the world."""
+    meet(here.surfaces, world.surfaces, here.where, place)
+    for t in range(here.friction.shape[1]):
+        here.friction[0, t] = world.friction[place, t]
         here.compliance[0, t] = world.compliance[place, t]
 
 
@@ -120,12 +121,14 @@ def _reach(world, o):
 def sound(world, o, law):
     """Whether planes and stiffness are finite, directions of length 1, friction within bounds and
     stiffness positive."""
-    total = 0.0
-    for t in range(world.normals.shape[1]):
+    total, e, surfaces = 0.0, world.where[0], world.surfaces
+    for t in range(world.friction.shape[1]):
         rough = world.friction[o, t]
-        total += abs(world.offsets[o, t]) + (0.0 if 0.0 <= rough <= LARGEST_FRICTION else np.inf)
+        nx, nz, offset = plane_of(surfaces, e, t)
+        total += abs(offset) + abs(world.clearance[o, t]) + spread(surfaces, e, t)
+        total += 0.0 if 0.0 <= rough <= LARGEST_FRICTION else np.inf
         total += world.compliance[o, t] if world.compliance[o, t] >= 0.0 else np.inf
-        square = world.normals[o, t, 0] ** 2 + world.normals[o, t, 1] ** 2
+        square = nx**2 + nz**2
         total += 0.0 if abs(square - 1.0) <= OFF_UNIT else np.inf
     for a in range(3):
         total += law.root[a] if law.stiffness[a] > 0.0 else np.inf

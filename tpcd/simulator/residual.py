@@ -12,21 +12,21 @@ from __future__ import annotations
 import math
 from typing import no_type_check
 
+from tpcd.geometry.candidates import nearest
 from tpcd.loops import inner
-from tpcd.simulator.geometry import lowest_point, object_normal
 
 
 @inner
 @no_type_check
 def depth_inside(world, o, chains, pose, load):
     """How deep the object is inside a terrain that yields to its `load` (t) [m]; at least 0."""
-    cosine, sine, deepest = math.cos(pose[2]), math.sin(pose[2]), 0.0
+    turn, deepest = (math.cos(pose[2]), math.sin(pose[2])), 0.0
     for t in range(len(load)):
-        deepest = max(deepest, -_gap(world, o, chains, t, pose, cosine, sine, load[t]))
+        deepest = max(deepest, -_gap(world, o, chains, t, pose, turn, load[t]))
     return deepest
 
 
-@inner(error_model="numpy")
+@inner(error_model="numpy", forceinline=True)
 @no_type_check
 def distance_from_rest(world, o, chains, law, extent, command, pose, turn, space):
     """How far a settled pose, turned by `turn` (cos, sin), is from rest at a command [m].
@@ -39,8 +39,8 @@ def distance_from_rest(world, o, chains, law, extent, command, pose, turn, space
         off = abs(system.unbalanced[a]) / law.stiffness[a]
         off = off if a < 2 else off * extent
         worst, total = max(worst, off), total + off
-    for t in range(world.normals.shape[1]):
-        gap = _gap(world, o, chains, t, pose, turn[0], turn[1], space.load[t])
+    for t in range(world.friction.shape[1]):
+        gap = _gap(world, o, chains, t, pose, turn, space.load[t])
         # What is pushed by convex friction may be away from the terrain.
         pushed = law.coulomb and space.load[t] > 0.0
         worst, total = max(worst, abs(gap) if pushed else -gap), total + gap
@@ -49,9 +49,7 @@ def distance_from_rest(world, o, chains, law, extent, command, pose, turn, space
 
 @inner
 @no_type_check
-def _gap(world, o, chains, t, pose, cosine, sine, load):
+def _gap(world, o, chains, t, pose, turn, load):
     """Gap to terrain t where it has yielded to a load [m]."""
-    u, v = object_normal(world, o, t, cosine, sine)
-    low, _ = lowest_point(world, o, chains, t, u, v)
-    gap = low + world.normals[o, t, 0] * pose[0] + world.normals[o, t, 1] * pose[1]
-    return gap - world.offsets[o, t] + world.compliance[o, t] * load
+    gap, _ = nearest(world, o, chains, t, (pose[0], pose[1]), turn)
+    return gap + world.compliance[o, t] * load

@@ -11,15 +11,18 @@ yields. The pose answers a change of their right-hand sides by
     dx = S (f + B^T dl),      (A S B^T + C) dl = r - A S f,      S = (K + turning)^-1,           (3)
 
 A being the rows' derivatives by the pose, C the compliance of rows on one terrain, and `turning`
-how the contact torques change as the outline turns.
+how the contact forces change as the outline turns and moves along what is curved: with normal row
+n, tangent row t, height h, lever l, curvature k and s = +-mu the sum over contacts of
+
+    lambda [(h + s l) e_phi e_phi^T - k (t - s n) t^T].
 """
 
 from __future__ import annotations
 
 from typing import no_type_check
 
+from tpcd.geometry.query import bent
 from tpcd.loops import inner
-from tpcd.simulator.geometry import object_normal
 
 SINGULAR = 1e-9
 """Determinant over the product of the row sums below which loaded rows count as dependent."""
@@ -37,9 +40,12 @@ def linear_system(world, o, law, command, pose, turn, space):
     """
     system, chosen, multiplier = space.system, space.chosen, space.multiplier
     rows, pushes, starts = system.rows, system.pushes, system.starts
-    turning = 0.0
+    soft, left, push = system.soft, system.left, system.push
+    curved = bent(world.surfaces)
     for a in range(3):
         system.unbalanced[a] = law.stiffness[a] * (pose[a] - command[a])
+        for b in range(3):
+            soft[a, b] = law.stiffness[a] if a == b else 0.0
     for j in range(len(space.room)):
         system.violated[j] = 0.0
         for a in range(3):
@@ -49,33 +55,56 @@ def linear_system(world, o, law, command, pose, turn, space):
         if chosen[j, 0] < 0:
             continue
         t, k = chosen[j, 1], chosen[j, 2]
-        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        x, z = space.place[t, k, 0], space.place[t, k, 1]
-        height, along = u * x + v * z, v * x - u * z
+        place, record = space.place, space.record
+        gap, nx, nz = record[t, k, 0], record[t, k, 1], record[t, k, 2]
+        height, along = record[t, k, 3], record[t, k, 4]
+        ax = turn[0] * place[t, k, 0] - turn[1] * place[t, k, 1]
+        az = turn[1] * place[t, k, 0] + turn[0] * place[t, k, 1]
+        # How far the point has come since the part's start.
+        dx, dz = pose[0] + ax - place[t, k, 4], pose[1] + az - place[t, k, 5]
         slope = space.side[j] * world.friction[o, t]
         drag = 0.0 if (law.coulomb and space.slipping[j]) else slope
-        slip = along + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
-        gap = height + nx * pose[0] + nz * pose[1] - world.offsets[o, t]
+        slip = nz * dx - nx * dz
         system.violated[j] = gap + drag * slip + world.compliance[o, t] * space.load[t]
-        rows[j, 0], rows[j, 1] = nx + drag * nz, nz - drag * nx
-        rows[j, 2] = along - drag * height
         pushes[j, 0], pushes[j, 1] = nx + slope * nz, nz - slope * nx
         pushes[j, 2] = along - slope * height
         for a in range(3):
             system.unbalanced[a] -= multiplier[j] * pushes[j, a]
-        turning += multiplier[j] * (height + slope * along)
+        soft[2, 2] += multiplier[j] * (height + slope * along)
         starts[j, 0], starts[j, 1] = -drag * nz, drag * nx
-        starts[j, 2] = -drag * space.place[t, k, 3]
-    system.soft[0], system.soft[1] = 1.0 / law.stiffness[0], 1.0 / law.stiffness[1]
-    system.soft[2] = 1.0 / (law.stiffness[2] + turning)
+        starts[j, 2] = drag * (nx * place[t, k, 2] + nz * place[t, k, 3])
+        if curved:
+            bend = record[t, k, 5]
+            tangent = (nz, -nx, -height)
+            bent_push = (nz - slope * nx, -nx - slope * nz, -height - slope * along)
+            for a in range(3):
+                for b in range(3):
+                    soft[a, b] -= multiplier[j] * bend * bent_push[a] * tangent[b]
+            drag *= 1.0 - bend * (nx * dx + nz * dz)
+        rows[j, 0], rows[j, 1] = nx + drag * nz, nz - drag * nx
+        rows[j, 2] = along - drag * height
+    if curved:
+        _invert_3(soft)
+        for j in range(len(space.room)):
+            for a in range(3):
+                left[j, a], push[j, a] = 0.0, 0.0
+                for b in range(3):
+                    left[j, a] += rows[j, b] * soft[b, a]
+                    push[j, a] += soft[a, b] * pushes[j, b]
+    else:
+        for a in range(3):
+            soft[a, a] = 1.0 / soft[a, a]
+        for j in range(len(space.room)):
+            for a in range(3):
+                left[j, a] = rows[j, a] * soft[a, a]
+                push[j, a] = soft[a, a] * pushes[j, a]
     for j in range(len(space.room)):
         for k in range(len(space.room)):
             value = 1.0 if j == k else 0.0
             if chosen[j, 0] >= 0 and chosen[k, 0] >= 0:
                 value = world.compliance[o, chosen[j, 1]] if chosen[j, 1] == chosen[k, 1] else 0.0
                 for a in range(3):
-                    value += rows[j, a] * system.soft[a] * pushes[k, a]
+                    value += rows[j, a] * push[k, a]
             system.inverse[j, k] = value
     if len(space.room) == 3:
         return _invert_3(system.inverse)
@@ -161,12 +190,14 @@ def respond(space):
             continue
         right = space.right[j]
         for a in range(3):
-            right -= system.rows[j, a] * system.soft[a] * force[a]
+            right -= system.left[j, a] * force[a]
         for i in range(len(space.room)):
             gain[i] += system.inverse[i, j] * right
     for a in range(3):
         # Rows of free places are zero.
-        push = force[a]
+        value = 0.0
+        for b in range(3):
+            value += system.soft[a, b] * force[b]
         for j in range(len(space.room)):
-            push += gain[j] * system.pushes[j, a]
-        space.change[a] = system.soft[a] * push
+            value += gain[j] * system.push[j, a]
+        space.change[a] = value

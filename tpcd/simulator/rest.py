@@ -31,11 +31,12 @@ from typing import no_type_check
 
 import numpy as np
 
+from tpcd.geometry.candidates import lowest_point, nearest, object_normal
+from tpcd.geometry.query import query, spread
 from tpcd.loops import inner
 from tpcd.qp.active_set import solve_whitened, solve_whitened_3
 from tpcd.qp.elastic import RELAXATION
 from tpcd.qp.problem import Status
-from tpcd.simulator.geometry import lowest_point, object_normal
 from tpcd.simulator.record import StepStatus
 from tpcd.simulator.response import linear_system, respond
 from tpcd.simulator.workspace import LIST
@@ -66,7 +67,7 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh, g
     """Settle one element, `afresh` from the start or from `pose`; leaves pose and loaded contacts,
     returns status and residual. Where no motion satisfies all rows, it is RELAXED, and they
     `give_way` if they may."""
-    terrains, system = world.normals.shape[1], space.system
+    terrains, system = world.friction.shape[1], space.system
     for t in range(terrains):
         if afresh:
             space.counts[t] = 0
@@ -117,6 +118,11 @@ def settle(world, o, chains, law, extent, start, command, space, pose, afresh, g
             if max(abs(step[0]), abs(step[1])) + abs(step[2]) * extent <= 2.0 * residual:
                 for a in range(3):
                     pose[a] += step[a]
+    if status == NOT_CONVERGED:
+        turn = (math.cos(pose[2]), math.sin(pose[2]))
+        for j in range(len(space.room)):
+            if space.chosen[j, 0] >= 0:
+                look(world, o, space.chosen[j, 1], space.chosen[j, 2], pose, turn, space)
     return status, residual
 
 
@@ -127,7 +133,7 @@ def _roughest(world, o, law):
     where that is less."""
     largest = 1.0
     if law.coulomb:
-        for t in range(world.normals.shape[1]):
+        for t in range(world.friction.shape[1]):
             largest = max(largest, world.friction[o, t])
     return largest
 
@@ -218,20 +224,19 @@ def _list_candidates(
 ):  # fmt: skip
     """List the points that could carry load at a pose, in round k; turns as (cos, sin). Where rows
     may `give_way`, a jammed face is held at both ends from the start."""
-    for t in range(world.normals.shape[1]):
-        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        u_start, v_start = object_normal(world, o, t, start_turn[0], start_turn[1])
-        if law.coulomb or k == 0:
-            low, point = lowest_point(world, o, chains, t, u, v)
+    for t in range(world.friction.shape[1]):
+        curved = spread(world.surfaces, world.where[0], t) > 0.0
+        if law.coulomb or k == 0 or curved:
+            gap, point = nearest(world, o, chains, t, (pose[0], pose[1]), turn)
             # Coulomb friction acts only where a terrain is touched; convex friction pushes
             # on bodies that it does not touch.
-            gap = low + nx * pose[0] + nz * pose[1] - world.offsets[o, t]
             if law.coulomb and space.counts[t] == 0 and gap > NEAR:
                 continue
-            _add(world, o, t, point, start, u_start, v_start, space)
-        if law.coulomb and not (give_way and k == 0):
+            _add(world, o, t, point, start, start_turn, space)
+        if curved or law.coulomb and not (give_way and k == 0):
             continue
+        u, v = object_normal(world, o, t, turn[0], turn[1])
+        u_start, v_start = object_normal(world, o, t, start_turn[0], start_turn[1])
         for side in range(2):
             # At first a flat face shows both its ends; later the row of side s asks for
             # gap + s mu slip of every point, which need not be least where the gap is.
@@ -242,12 +247,12 @@ def _list_candidates(
                 slope = world.friction[o, t] * sign
                 du, dv = slope * (v - v_start), -slope * (u - u_start)
             _, point = lowest_point(world, o, chains, t, u + du, v + dv)
-            _add(world, o, t, point, start, u_start, v_start, space)
+            _add(world, o, t, point, start, start_turn, space)
 
 
 @inner
 @no_type_check
-def _add(world, o, t, point, start, u_start, v_start, space):
+def _add(world, o, t, point, start, start_turn, space):
     """Put a point on the list of terrain t; when full it replaces the oldest."""
     for k in range(min(space.counts[t], LIST)):
         if space.listed[t, k] == point:
@@ -256,13 +261,27 @@ def _add(world, o, t, point, start, u_start, v_start, space):
     space.counts[t] += 1
     space.listed[t, k] = point
     x, z = world.points[o, 0, point], world.points[o, 1, point]
-    tangential = v_start * x - u_start * z
     place = space.place
     place[t, k, 0], place[t, k, 1] = x, z
-    place[t, k, 2] = (
-        tangential + world.normals[o, t, 1] * start[0] - world.normals[o, t, 0] * start[1]
-    )
-    place[t, k, 3] = -(u_start * x + v_start * z)
+    place[t, k, 2] = start_turn[0] * x - start_turn[1] * z
+    place[t, k, 3] = start_turn[1] * x + start_turn[0] * z
+    place[t, k, 4], place[t, k, 5] = start[0] + place[t, k, 2], start[1] + place[t, k, 3]
+
+
+@inner(forceinline=True)
+@no_type_check
+def look(world, o, t, k, pose, turn, space):
+    """Record the contact of a listed candidate at a pose; also its slip since the part's start."""
+    place, record = space.place, space.record
+    ax = turn[0] * place[t, k, 0] - turn[1] * place[t, k, 1]
+    az = turn[1] * place[t, k, 0] + turn[0] * place[t, k, 1]
+    x, z = pose[0] + ax, pose[1] + az
+    gap, nx, nz, bend = query(world.surfaces, world.where[0], t, x, z)
+    gap += world.clearance[o, t]
+    height, along = nx * ax + nz * az, nz * ax - nx * az
+    record[t, k, 0], record[t, k, 1], record[t, k, 2] = gap, nx, nz
+    record[t, k, 3], record[t, k, 4], record[t, k, 5] = height, along, bend
+    return gap, nx, nz, height, along, nz * (x - place[t, k, 4]) - nx * (z - place[t, k, 5])
 
 
 @inner(error_model="numpy", forceinline=True)
@@ -273,19 +292,12 @@ def _build_rows(world, o, law, command, pose, turn, space):
     away_x, away_z, away_turn = command[0] - pose[0], command[1] - pose[1], command[2] - pose[2]
     root_x, root_z, root_turn = 1.0 / law.root[0], 1.0 / law.root[1], 1.0 / law.root[2]
     m = 0
-    for t in range(world.normals.shape[1]):
-        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        gap_base = nx * pose[0] + nz * pose[1] - world.offsets[o, t]
-        slip_base = nz * pose[0] - nx * pose[1]
+    for t in range(world.friction.shape[1]):
         mu, yields = world.friction[o, t], math.sqrt(world.compliance[o, t])
         for k in range(min(space.counts[t], LIST)):
-            x, z = space.place[t, k, 0], space.place[t, k, 1]
-            # Height and tangential position of the point over the end effector; the angle
-            # moves the one by the other.
-            height, along = u * x + v * z, v * x - u * z
-            slip = along + slip_base - space.place[t, k, 2]
-            common = gap_base + height
+            # Height and tangential position of the point over the end effector: the angle moves
+            # the one by the other.
+            common, nx, nz, height, along, slip = look(world, o, t, k, pose, turn, space)
             if law.coulomb:
                 common += mu * abs(slip)
             for s in range(2):
@@ -322,7 +334,7 @@ def _build_rows(world, o, law, command, pose, turn, space):
 @no_type_check
 def _choose(world, o, law, pose, turn, space):
     """Read the loaded rows off the solved problem."""
-    for t in range(world.normals.shape[1]):
+    for t in range(world.friction.shape[1]):
         space.load[t] = 0.0
     space.slid[0] = False
     for j in range(len(space.room)):
@@ -336,11 +348,7 @@ def _choose(world, o, law, pose, turn, space):
         space.multiplier[j] = space.multipliers[r] / space.lengths[r]
         space.side[j] = 1.0 - 2.0 * (space.source[r, 1] % 2)
         space.load[t] += space.multiplier[j]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        slip = (
-            v * space.place[t, k, 0] - u * space.place[t, k, 1] - space.place[t, k, 2]
-            + world.normals[o, t, 1] * pose[0] - world.normals[o, t, 0] * pose[1]
-        )  # fmt: skip
+        _, _, _, _, _, slip = look(world, o, t, k, pose, turn, space)
         space.slipping[j] = abs(slip) > SLIGHT * law.tolerance
         space.slid[0] = space.slid[0] or space.slipping[j]
     for j in range(len(space.room)):

@@ -12,9 +12,10 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
+from tpcd.geometry.candidates import frame
+from tpcd.geometry.query import bent
 from tpcd.loops import inner
 from tpcd.simulator.events import touch_row
-from tpcd.simulator.geometry import object_normal
 from tpcd.simulator.response import respond
 
 GRAZING = 1e-9
@@ -101,12 +102,14 @@ def landing_response(world, o, start, command, fraction, point, terrain, slopes)
     if fraction == 0.0:
         return
     angle = start[2] + fraction * (command[2] - start[2])
-    u, v = object_normal(world, o, terrain, math.cos(angle), math.sin(angle))
-    row = (
-        world.normals[o, terrain, 0],
-        world.normals[o, terrain, 1],
-        v * world.points[o, 0, point] - u * world.points[o, 1, point],
-    )
+    here = (
+        start[0] + fraction * (command[0] - start[0]), start[1] + fraction * (command[1] - start[1])
+    )  # fmt: skip
+    _, nx, nz, _, along, _ = frame(
+        world, o, terrain, world.points[o, 0, point], world.points[o, 1, point], here,
+        (math.cos(angle), math.sin(angle)),
+    )  # fmt: skip
+    row = (nx, nz, along)
     approach, way = 0.0, 0.0
     for a in range(3):
         approach -= row[a] * (command[a] - start[a])
@@ -135,14 +138,14 @@ def settling_response(law, terrains, space, slopes):
         for j in range(len(space.room)):
             value = 0.0
             for i in range(len(space.room)):
-                value += system.pushes[i, a] * system.inverse[i, j]
-            follow[a, j] = system.soft[a] * value
+                value += system.push[i, a] * system.inverse[i, j]
+            follow[a, j] = value
     for a in range(3):
         for c in range(3):
-            value = system.soft[a] if a == c else 0.0
+            value = system.soft[a, c]
             by_start = 0.0
             for j in range(len(space.room)):
-                value -= follow[a, j] * system.rows[j, c] * system.soft[c]
+                value -= follow[a, j] * system.left[j, c]
                 by_start -= follow[a, j] * system.starts[j, c]
             yields[a, c] = value
             slopes.response[a, c] = by_start
@@ -260,8 +263,6 @@ def append_further(
     far on the path the part's `command` is, which is `rested` when the path begins at the start. At
     a given pose, an input leaves a force on the balance and right-hand sides of the rows.
     """
-    if slopes.inputs == 0:
-        return
     point, terrain = touch
     which, passed, terrains = event[0], event[1], slopes.land_gap.shape[0]
     further, nothing = slopes.further, (0.0, 0.0, 0.0)
@@ -272,7 +273,7 @@ def append_further(
         direct = nothing
         if space.load[t] > 0.0 and not relaxed:
             _clear(space)
-            _by_friction(world, o, law, t, turn, pose, space)
+            _by_friction(law, t, turn, pose, space)
             direct = _direct(world, o, event, 0.0, pose, space, slopes.rate)
         _string_row(slopes, further, t, direct, 0.0, 0, 0.0, 0)
     if slopes.inputs > terrains:
@@ -284,7 +285,7 @@ def append_further(
             direct = _direct(world, o, event, 0.0, pose, space, slopes.rate)
             _string_row(slopes, further, terrains + t, direct, 0.0, 0, 0.0, 0)
             _clear(space)
-            _by_normal(world, o, law, t, turn, landed, landing, pose, space)
+            _by_normal(world, o, law, t, turn, pose, space)
             later = _turned_gap(world, o, t, passed, turn, pose) if t == coming else 0.0
             direct = _direct(world, o, event, later, pose, space, slopes.rate)
             gap = _turned_gap(world, o, t, point, landed, landing) if t == terrain else 0.0
@@ -304,24 +305,30 @@ def append_further(
     for j in range(len(space.room)):
         if space.chosen[j, 0] >= 0:
             _touch(slopes, space.chosen[j, 0], space.chosen[j, 1])
+    _, touch_x, touch_z, _, _, _ = frame(
+        world, o, terrain, world.points[o, 0, point], world.points[o, 1, point],
+        (landing[0], landing[1]), landed,
+    )  # fmt: skip
     for i in range(slopes.count[0]):
         p, t = slopes.touched[i, 0], slopes.touched[i, 1]
-        u, v = object_normal(world, o, t, turn[0], turn[1])
-        u_landed, v_landed = object_normal(world, o, t, landed[0], landed[1])
         first_met, met = p == point and t == terrain, p == passed and t == coming
         held = False
         for j in range(len(space.room)):
             held = held or (space.chosen[j, 0] == p and space.chosen[j, 1] == t)
         for c in range(2):
+            # In world axes the coordinate c moves the point by (x, z), and its start by the other.
+            x, z = (turn[0], turn[1]) if c == 0 else (-turn[1], turn[0])
+            from_x, from_z = (landed[0], landed[1]) if c == 0 else (-landed[1], landed[0])
             direct = nothing
             if held or met:
                 _clear(space)
-                height, along = (u, v) if c == 0 else (v, -u)
-                shifted = along - (v_landed if c == 0 else -u_landed)
-                _by_point(world, o, law, p, t, height, along, shifted, space)
-                later = height if met else 0.0
+                _by_point(world, o, law, p, t, turn, pose, x, z, from_x, from_z, space)
+                later = 0.0
+                if met:
+                    touch_row(world, o, t, p, pose, space.change)
+                    later = space.change[0] * x + space.change[1] * z
                 direct = _direct(world, o, event, later, pose, space, slopes.rate)
-            gap = (u_landed if c == 0 else v_landed) if first_met else 0.0
+            gap = touch_x * from_x + touch_z * from_z if first_met else 0.0
             _string_row(slopes, further, slopes.inputs + 2 * i + c, direct, gap, terrain, 0.0, 0)
 
 
@@ -375,55 +382,72 @@ def _direct(world, o, event, gap, pose, space, rate):
 
 @inner
 @no_type_check
-def _by_friction(world, o, law, t, turn, pose, space):
+def _come(space, t, k, turn, pose):
+    """How far candidate k of terrain t has come since the part's start, in world axes."""
+    x, z = space.place[t, k, 0], space.place[t, k, 1]
+    dx = pose[0] + turn[0] * x - turn[1] * z - space.place[t, k, 4]
+    return dx, pose[1] + turn[1] * x + turn[0] * z - space.place[t, k, 5]
+
+
+@inner
+@no_type_check
+def _by_friction(law, t, turn, pose, space):
     """Forces and right-hand sides of more friction on terrain t."""
-    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-    u, v = object_normal(world, o, t, turn[0], turn[1])
     for j in range(len(space.room)):
         if space.chosen[j, 0] < 0 or space.chosen[j, 1] != t:
             continue
         k, push = space.chosen[j, 2], space.multiplier[j] * space.side[j]
-        x, z = space.place[t, k, 0], space.place[t, k, 1]
+        nx, nz = space.record[t, k, 1], space.record[t, k, 2]
         if not (law.coulomb and space.slipping[j]):
-            slip = v * x - u * z + nz * pose[0] - nx * pose[1] - space.place[t, k, 2]
-            space.right[j] = -space.side[j] * slip
+            dx, dz = _come(space, t, k, turn, pose)
+            space.right[j] = -space.side[j] * (nz * dx - nx * dz)
         space.force[0] += push * nz
         space.force[1] -= push * nx
-        space.force[2] -= push * (u * x + v * z)
+        space.force[2] -= push * space.record[t, k, 3]
 
 
 @inner
 @no_type_check
-def _by_point(world, o, law, p, t, height, along, shifted, space):
-    """Forces and right-hand sides of an outline point that is moved by (`height`, `along`) over
-    terrain t, and by `shifted` since the part's start."""
+def _by_point(world, o, law, p, t, turn, pose, x, z, from_x, from_z, space):
+    """Forces and right-hand sides of an outline point that is moved by (x, z) where it touches
+    terrain t, and by (`from_x`, `from_z`) where it was at the part's start."""
     for j in range(len(space.room)):
         if space.chosen[j, 0] != p or space.chosen[j, 1] != t:
             continue
+        k, load = space.chosen[j, 2], space.multiplier[j]
+        nx, nz = space.record[t, k, 1], space.record[t, k, 2]
+        height, along = nx * x + nz * z, nz * x - nx * z
         slope = space.side[j] * world.friction[o, t]
         drag = 0.0 if law.coulomb and space.slipping[j] else slope
+        shifted = along - (nz * from_x - nx * from_z)
+        if bent(world.surfaces):
+            # Along what is curved the normal turns, dn = k t ds, and the tangent, dt = -k n ds.
+            dx, dz = _come(space, t, k, turn, pose)
+            turned = space.record[t, k, 5] * along
+            shifted -= turned * (nx * dx + nz * dz)
+            space.force[0] += load * turned * (nz - slope * nx)
+            space.force[1] -= load * turned * (nx + slope * nz)
+            space.force[2] -= (
+                load * turned * (space.record[t, k, 3] + slope * space.record[t, k, 4])
+            )
         space.right[j] = -(height + drag * shifted)
-        space.force[2] += space.multiplier[j] * (along - slope * height)
+        space.force[2] += load * (along - slope * height)
 
 
 @inner
 @no_type_check
-def _by_normal(world, o, law, t, turn, landed, landing, pose, space):
-    """Forces and right-hand sides of terrain t that is turned, its normal n to its tangent -t."""
-    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-    u, v = object_normal(world, o, t, turn[0], turn[1])
-    u_landed, v_landed = object_normal(world, o, t, landed[0], landed[1])
+def _by_normal(world, o, law, t, turn, pose, space):
+    """Forces and right-hand sides of a plane t that is turned, its normal n to its tangent -t."""
     for j in range(len(space.room)):
         if space.chosen[j, 0] < 0 or space.chosen[j, 1] != t:
             continue
         k, load = space.chosen[j, 2], space.multiplier[j]
-        x, z = space.place[t, k, 0], space.place[t, k, 1]
-        height, along = u * x + v * z, v * x - u * z
+        nx, nz = space.record[t, k, 1], space.record[t, k, 2]
+        height, along = space.record[t, k, 3], space.record[t, k, 4]
         slope = space.side[j] * world.friction[o, t]
         drag = 0.0 if law.coulomb and space.slipping[j] else slope
-        risen = height - (u_landed * x + v_landed * z)
-        risen += nx * (pose[0] - landing[0]) + nz * (pose[1] - landing[1])
-        space.right[j] = along + nz * pose[0] - nx * pose[1] - drag * risen
+        dx, dz = _come(space, t, k, turn, pose)
+        space.right[j] = along + nz * pose[0] - nx * pose[1] - drag * (nx * dx + nz * dz)
         space.force[0] += load * (slope * nx - nz)
         space.force[1] += load * (slope * nz + nx)
         space.force[2] += load * (height + slope * along)
@@ -432,10 +456,10 @@ def _by_normal(world, o, law, t, turn, landed, landing, pose, space):
 @inner
 @no_type_check
 def _turned_gap(world, o, t, point, turn, pose):
-    """How the gap of a point to terrain t moves as its normal turns."""
-    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-    u, v = object_normal(world, o, t, turn[0], turn[1])
-    along = v * world.points[o, 0, point] - u * world.points[o, 1, point]
+    """How the gap of a point to a plane t moves as its normal turns."""
+    _, nx, nz, _, along, _ = frame(
+        world, o, t, world.points[o, 0, point], world.points[o, 1, point], (pose[0], pose[1]), turn
+    )
     return -(along + nz * pose[0] - nx * pose[1])
 
 

@@ -19,11 +19,9 @@ they are positive. They stay so while what friction adds is less than what was t
 
 from __future__ import annotations
 
-import math
 from typing import no_type_check
 
 from tpcd.loops import inner
-from tpcd.simulator.geometry import object_normal
 from tpcd.simulator.rest import CONVERGED
 
 LIGHTER = 0.999
@@ -34,9 +32,9 @@ are not quite where they would be elsewhere. Of steps in corners that had anothe
 load, none had less than 1."""
 
 
-@inner
+@inner(forceinline=True)
 @no_type_check
-def may_wedge(world, o, law, pose, space, ended):
+def may_wedge(world, o, law, space, ended):
     """Whether two terrains load the element, settled with the status `ended`, such that it may
     rest elsewhere too."""
     chosen, first, second, alone = space.chosen, -1, -1, True
@@ -55,15 +53,14 @@ def may_wedge(world, o, law, pose, space, ended):
     if second < 0 or not law.coulomb:
         return False
     alone = alone and ended == CONVERGED
-    return not (alone and _rests_one_way(world, o, law, pose, space, first, second))
+    return not (alone and _rests_one_way(world, o, law, space, first, second))
 
 
 @inner(error_model="numpy")
 @no_type_check
-def _rests_one_way(world, o, law, pose, space, first, second):
+def _rests_one_way(world, o, law, space, first, second):
     """Whether loads and slips of two contact points follow from any command in one way."""
-    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
-    a, b = _rows(world, o, space, first, cosine, sine), _rows(world, o, space, second, cosine, sine)
+    a, b = _rows(space, first), _rows(space, second)
     t, s = space.chosen[first, 1], space.chosen[second, 1]
     rough_a, rough_b = world.friction[o, t], world.friction[o, s]
     give_a = _product(law, a[0], a[0]) + world.compliance[o, t]
@@ -102,13 +99,11 @@ def _slips_one_way(rough, give_i, drag_i, along_i, give, drag, both, by_i, by, a
 
 @inner
 @no_type_check
-def _rows(world, o, space, j, cosine, sine):
+def _rows(space, j):
     """How gap and place of a loaded row's point move with the pose."""
     t, k = space.chosen[j, 1], space.chosen[j, 2]
-    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-    u, v = object_normal(world, o, t, cosine, sine)
-    x, z = space.place[t, k, 0], space.place[t, k, 1]
-    return (nx, nz, v * x - u * z), (nz, -nx, -(u * x + v * z))
+    nx, nz = space.record[t, k, 1], space.record[t, k, 2]
+    return (nx, nz, space.record[t, k, 4]), (nz, -nx, -space.record[t, k, 3])
 
 
 @inner(error_model="numpy", forceinline=True)

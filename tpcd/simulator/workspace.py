@@ -33,9 +33,10 @@ class Law(NamedTuple):
 class System(NamedTuple):
     """The rest equations of the k loaded rows, as filled by `linear_system`.
 
-    `rows` (k, 3) of the constraints, `pushes` (k, 3) of their forces, `soft` (3) inverse
-    stiffness, `unbalanced` (3) and `violated` (k) residuals of the balance and of the rows,
-    `inverse` (k, k) of the Schur complement, `starts` (k, 3) how rows move with the start pose.
+    `rows` (k, 3) of the constraints, `pushes` (k, 3) of their forces, `soft` (3, 3) inverse
+    stiffness, `left` (k, 3) rows times that and `push` (k, 3) that times forces, `unbalanced` (3)
+    and `violated` (k) residuals of the balance and of the rows, `inverse` (k, k) of the Schur
+    complement, `starts` (k, 3) how rows move with the start pose.
     """
 
     rows: np.ndarray
@@ -45,6 +46,8 @@ class System(NamedTuple):
     violated: np.ndarray
     inverse: np.ndarray
     starts: np.ndarray
+    left: np.ndarray
+    push: np.ndarray
 
 
 class Elastic(NamedTuple):
@@ -90,8 +93,10 @@ class Recall(NamedTuple):
 class Space(NamedTuple):
     """Everything one element works on.
 
-    Candidates of terrain t (t, LIST): `listed` who, `place` (.., 4) its coordinates in the
-    end-effector frame, its tangential position at the start and the start's tangent lever.
+    Candidates of terrain t (t, LIST): `listed` who, `place` (.., 6) its coordinates in the
+    end-effector frame, its arm from the end effector at the part's start in world axes, and where
+    it was then, `record` (.., 6) its contact at the last pose: gap, normal (x, z), height over the
+    end effector, lever, and curvature.
     Rows of the contact problem, up to 2 t LIST of them: `rows`, `values`, `sizes`,
     `lengths`, `multipliers`, and in `source` (.., 2) terrain and place on the list. The k
     rows that may carry load (`room`, as in `Law`): `chosen` (k, 3) point (-1 where free), terrain
@@ -103,6 +108,7 @@ class Space(NamedTuple):
     listed: np.ndarray
     counts: np.ndarray
     place: np.ndarray
+    record: np.ndarray
     load: np.ndarray
     rows: np.ndarray
     values: np.ndarray
@@ -139,7 +145,8 @@ def new_space(terrains, room, calls):
         room,
         np.zeros((terrains, LIST), np.int64),
         np.zeros(terrains, np.int64),
-        np.zeros((terrains, LIST, 4)),
+        np.zeros((terrains, LIST, 6)),
+        np.zeros((terrains, LIST, 6)),
         np.zeros(terrains),
         np.empty((width, k)),
         np.empty(width),
@@ -153,10 +160,12 @@ def new_space(terrains, room, calls):
         System(
             np.empty((k, 3)),
             np.empty((k, 3)),
-            np.empty(3),
+            np.zeros((3, 3)),
             np.empty(3),
             np.empty(k),
             np.empty((k, k)),
+            np.empty((k, 3)),
+            np.empty((k, 3)),
             np.empty((k, 3)),
         ),
         np.zeros((k, 3), np.int64),

@@ -1,4 +1,4 @@
-"""Geometry of the quasi-static step: which outline point is lowest over a half-plane.
+"""Which outline points can touch: the nearest one to a surface, and the first touch on a way.
 
 A half-plane touches an outline only at its hull, and over the few angles that the steps of
 one scene pass through only at a short piece of it. `build_chains` finds that piece once for
@@ -6,8 +6,7 @@ each scene and terrain, rigorously and for points in any order; the many questio
 lowest point then look at a handful of points. Directions outside of the piece fall back to
 all points, so the answers are exact always.
 
-Arrays of the flat batch of scenes: `points` (s, 2, p) outline in the end-effector frame,
-`normals` (s, t, 2), `offsets`, `friction` and `compliance` (s, t).
+A surface that leaves its plane keeps all points that may come below by as much as it does.
 """
 
 from __future__ import annotations
@@ -17,6 +16,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
+from tpcd.geometry.query import plane_of, query, spread
+from tpcd.geometry.surfaces import HalfPlanes, SurfaceTable
 from tpcd.loops import inner
 
 FREE_GAP = 1e-5
@@ -28,11 +29,17 @@ WIDEST = 1.2
 
 
 class World(NamedTuple):
-    """All scenes of the batch, as in the file's opening."""
+    """Objects and what they meet: outlines `points` (s, 2, p) in the end-effector frame [m], a
+    table of surfaces, and `friction` and `compliance` [m/N] (s, t) of each.
+
+    Of one element, `where` (1) says which of the table's environments it meets, and `clearance`
+    (1, t) how much further away its surfaces are [m].
+    """
 
     points: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
+    surfaces: HalfPlanes | SurfaceTable
+    where: np.ndarray
+    clearance: np.ndarray
     friction: np.ndarray
     compliance: np.ndarray
 
@@ -70,9 +77,20 @@ def new_chains(terrains, count):
 @inner
 @no_type_check
 def object_normal(world, o, t, cosine, sine):
-    """The normal of terrain t as the object sees it, turned by the angle of cosine and sine."""
-    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
+    """The normal of terrain t's plane as the object sees it, turned by the angle of cosine and
+    sine."""
+    nx, nz, _ = plane_of(world.surfaces, world.where[0], t)
     return cosine * nx + sine * nz, cosine * nz - sine * nx
+
+
+@inner(forceinline=True)
+@no_type_check
+def frame(world, o, t, x, z, pose, turn):
+    """Contact of the object's point (x, z) [m] with surface t at a pose, turned by `turn` (cos,
+    sin): gap, normal, height over the end effector along it, lever along its tangent, curvature."""
+    ax, az = turn[0] * x - turn[1] * z, turn[1] * x + turn[0] * z
+    gap, nx, nz, bend = query(world.surfaces, world.where[0], t, pose[0] + ax, pose[1] + az)
+    return gap + world.clearance[o, t], nx, nz, nx * ax + nz * az, nz * ax - nx * az, bend
 
 
 @inner(fastmath={"nsz", "contract", "nnan"})
@@ -100,7 +118,7 @@ def build_chains(world, o, low, high, margin, chains):
     cosine, sine = math.cos(0.5 * (low + high)), math.sin(0.5 * (low + high))
     slope = math.tan(half)
     count = world.points.shape[2]
-    for t in range(world.normals.shape[1]):
+    for t in range(world.friction.shape[1]):
         a, b = object_normal(world, o, t, cosine, sine)
         chains.centre[t, 0], chains.centre[t, 1], chains.slope[t] = a, b, slope
         height, lever, index = chains.height, chains.lever, chains.index
@@ -110,10 +128,10 @@ def build_chains(world, o, low, high, margin, chains):
             best += 1
         foot = lever[t, best]
         # Only these can come below the lowest point within the half angle.
-        kept = 0
+        kept, leaves = 0, spread(world.surfaces, world.where[0], t)
         for i in range(count):
             up, side = height[t, i], lever[t, i]
-            if up - lowest <= slope * abs(side - foot):
+            if up - lowest <= slope * abs(side - foot) + leaves:
                 # Sort by lever as they come; counter-clockwise outlines are nearly sorted.
                 k = kept
                 while k > 0 and lever[t, k - 1] > side:
@@ -122,7 +140,7 @@ def build_chains(world, o, low, high, margin, chains):
                     k -= 1
                 height[t, k], lever[t, k], index[t, k] = up, side, i
                 kept += 1
-        chains.size[t] = _lower_hull(height, lever, index, t, kept)
+        chains.size[t] = kept if leaves > 0.0 else _lower_hull(height, lever, index, t, kept)
 
 
 @inner
@@ -171,14 +189,34 @@ def lowest_point(world, o, chains, t, u, v):
 
 @inner
 @no_type_check
+def nearest(world, o, chains, t, pose, turn):
+    """Least gap of the outline to surface t at a pose [m], and the point that has it."""
+    u, v = object_normal(world, o, t, turn[0], turn[1])
+    if not spread(world.surfaces, world.where[0], t) > 0.0:
+        low, point = lowest_point(world, o, chains, t, u, v)
+        gap, _, _, _ = query(world.surfaces, world.where[0], t, pose[0], pose[1])
+        return low + gap + world.clearance[o, t], point
+    a, b = chains.centre[t, 0], chains.centre[t, 1]
+    inside = abs(b * u - a * v) <= chains.slope[t] * (a * u + b * v)
+    least, best = np.inf, 0
+    for k in range(chains.size[t] if inside else world.points.shape[2]):
+        i = chains.index[t, k] if inside else k
+        gap, _, _, _, _, _ = frame(
+            world, o, t, world.points[o, 0, i], world.points[o, 1, i], pose, turn
+        )
+        if gap < least:
+            least, best = gap, i
+    return least, best
+
+
+@inner
+@no_type_check
 def lowest_gap(world, o, chains, x, z, angle):
     """Smallest gap over all terrains at a pose, with its point and terrain."""
-    cosine, sine = math.cos(angle), math.sin(angle)
+    turn = (math.cos(angle), math.sin(angle))
     best, best_point, best_terrain = np.inf, 0, 0
-    for t in range(world.normals.shape[1]):
-        u, v = object_normal(world, o, t, cosine, sine)
-        low, point = lowest_point(world, o, chains, t, u, v)
-        gap = low + world.normals[o, t, 0] * x + world.normals[o, t, 1] * z - world.offsets[o, t]
+    for t in range(world.friction.shape[1]):
+        gap, point = nearest(world, o, chains, t, (x, z), turn)
         if gap < best:
             best, best_point, best_terrain = gap, point, t
     return best, best_point, best_terrain
@@ -188,13 +226,11 @@ def lowest_gap(world, o, chains, x, z, angle):
 @no_type_check
 def touching(world, o, chains, pose):
     """Bit mask of the terrains within `FREE_GAP` of the object."""
-    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    turn = (math.cos(pose[2]), math.sin(pose[2]))
     mask = 0
-    for t in range(world.normals.shape[1]):
-        u, v = object_normal(world, o, t, cosine, sine)
-        low, _ = lowest_point(world, o, chains, t, u, v)
-        nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
-        if low + nx * pose[0] + nz * pose[1] - world.offsets[o, t] <= FREE_GAP:
+    for t in range(world.friction.shape[1]):
+        gap, _ = nearest(world, o, chains, t, (pose[0], pose[1]), turn)
+        if gap <= FREE_GAP:
             mask |= 1 << t
     return mask
 
@@ -238,24 +274,25 @@ def _touch_of_point(world, o, t, i, start, command, high, gap_high):
     Newton's method on its gap, which is free at the start and below zero at `high`, kept
     in the bracket by bisection.
     """
-    nx, nz = world.normals[o, t, 0], world.normals[o, t, 1]
     x, z = world.points[o, 0, i], world.points[o, 1, i]
-    way = nx * (command[0] - start[0]) + nz * (command[1] - start[1])
-    base = nx * start[0] + nz * start[1] - world.offsets[o, t]
     turn = command[2] - start[2]
     low, trial, gap = 0.0, high, gap_high
     for _ in range(60):
         angle = start[2] + trial * turn
-        cosine, sine = math.cos(angle), math.sin(angle)
-        u, v = cosine * nx + sine * nz, cosine * nz - sine * nx
-        gap = base + trial * way + u * x + v * z
+        here = (
+            start[0] + trial * (command[0] - start[0]),
+            start[1] + trial * (command[1] - start[1]),
+        )
+        gap, nx, nz, _, lever, _ = frame(
+            world, o, t, x, z, here, (math.cos(angle), math.sin(angle))
+        )
         if abs(gap) <= 1e-16:
             break
         if gap > 0.0:
             low = trial
         else:
             high = trial
-        rate = way + turn * (v * x - u * z)
+        rate = nx * (command[0] - start[0]) + nz * (command[1] - start[1]) + turn * lever
         newton = trial - gap / rate if rate < 0.0 else -1.0
         if not (newton > low and newton < high):
             newton = 0.5 * (low + high)

@@ -1,0 +1,1 @@
+"""What an object can touch: tables of surfaces, the contact query, the search for candidates."""

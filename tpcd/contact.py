@@ -3,7 +3,7 @@ terrains that it can touch, for each element of a batch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -93,7 +93,8 @@ class ContactScene:
         planes = []
         for body, more in zip(self.terrains, gap.unbind(-1), strict=True):
             offset = body.offset - more
-            planes.append(HalfPlane(body.direction.expand(*offset.shape, 2), offset))
+            direction = body.direction.expand(*offset.shape, 2)
+            planes.append(replace(body, direction=direction, offset=offset))
         return ContactScene(self.points_ee, tuple(planes), self.friction, self.compliance)
 
     def columns(self, index: Int[Tensor, " n"]) -> ContactScene:
@@ -104,7 +105,8 @@ class ContactScene:
 
         planes = []
         for body in self.terrains:
-            planes.append(HalfPlane(pick(body.direction, -2), pick(body.offset, -1)))
+            direction, offset = pick(body.direction, -2), pick(body.offset, -1)
+            planes.append(replace(body, direction=direction, offset=offset))
         more = (pick(self.friction, -2), pick(self.compliance, -2))
         return ContactScene(pick(self.points_ee, -3), tuple(planes), *more)
 
@@ -140,7 +142,8 @@ def column_scene(scene: ContactScene) -> ContactScene:
     """The scenes of m particles with an axis for transitions after theirs: batch (m, 1)."""
     planes = []
     for body in scene.terrains:
-        planes.append(HalfPlane(body.direction[..., None, :], body.offset[..., None]))
+        direction, offset = body.direction[..., None, :], body.offset[..., None]
+        planes.append(replace(body, direction=direction, offset=offset))
     return ContactScene(
         scene.points_ee[..., None, :, :],
         tuple(planes),

@@ -16,7 +16,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from tpcd.geometry.query import plane_of, query, spread
+from tpcd.geometry.query import bent, plane_of, query, spread
 from tpcd.geometry.surfaces import HalfPlanes, SurfaceTable
 from tpcd.loops import inner
 
@@ -24,6 +24,8 @@ FREE_GAP = 1e-5
 """A start pose flies when every gap exceeds this [m]."""
 TOUCH_ROUNDS = 20
 """Cap on the points that the search for the first touch may try; it mostly needs two."""
+ADVANCES, TOUCHED = 1000, 1e-9
+"""Most steps of conservative advancement, and the gap at which it has arrived [m]."""
 WIDEST = 1.2
 """Largest half angle for which a chain is built [rad]; wider turns look at all points."""
 
@@ -246,6 +248,8 @@ def first_touch(world, o, chains, start, command):
     gap_start, point, terrain = lowest_gap(world, o, chains, start[0], start[1], start[2])
     if gap_start <= FREE_GAP:
         return 0.0, point, terrain
+    if bent(world.surfaces):
+        return _advance(world, o, chains, start, command, gap_start)
     gap, point, terrain = lowest_gap(world, o, chains, command[0], command[1], command[2])
     if gap >= 0.0:
         return 1.0, point, terrain
@@ -264,6 +268,31 @@ def first_touch(world, o, chains, start, command):
             break
         point, terrain = next_point, next_terrain
     return high, point, terrain
+
+
+@inner
+@no_type_check
+def _advance(world, o, chains, start, command, gap):
+    """The same where surfaces are curved, and what is free at the command may be on the way: by
+    conservative advancement (Mirtich 1996), which never goes further than the least gap allows.
+    That is known to first order, of which half is taken."""
+    reach = 0.0
+    for i in range(world.points.shape[2]):
+        reach = max(reach, world.points[o, 0, i] ** 2 + world.points[o, 1, i] ** 2)
+    way = math.hypot(command[0] - start[0], command[1] - start[1])
+    way += math.sqrt(reach) * abs(command[2] - start[2])
+    done, point, terrain = 0.0, 0, 0
+    for _ in range(ADVANCES):
+        done += 0.5 * gap / way if 0.5 * gap < way else 1.0
+        if done >= 1.0:
+            return 1.0, point, terrain
+        gap, point, terrain = lowest_gap(
+            world, o, chains, start[0] + done * (command[0] - start[0]),
+            start[1] + done * (command[1] - start[1]), start[2] + done * (command[2] - start[2]),
+        )  # fmt: skip
+        if gap <= TOUCHED:
+            break
+    return done, point, terrain
 
 
 @inner

@@ -84,7 +84,7 @@ def _bent(surfaces):
 def _spread(surfaces, e, t):
     if surfaces.instance_class is HalfPlanes:
         return lambda surfaces, e, t: 0.0
-    return lambda surfaces, e, t: surfaces.spread[e, t]
+    return lambda surfaces, e, t: surfaces.spread[t]
 
 
 @overload(own_surfaces)
@@ -143,7 +143,7 @@ def by_kind(surfaces, e, t, x, z):
     gap, nx, nz, _ = half_plane(surfaces, e, t, x, z)
     if surfaces.kind[t] != HEIGHT_FIELD:
         return gap, nx, nz, 0.0
-    rise, slope, bend = _height(surfaces, e, t, nz * x - nx * z)
+    rise, slope, bend = _height(surfaces, t, nz * x - nx * z)
     size = math.sqrt(1.0 + slope * slope)
     normal_x, normal_z = (nx - slope * nz) / size, (nz + slope * nx) / size
     return (gap - rise) / size, normal_x, normal_z, -bend / (size * size * size)
@@ -151,19 +151,18 @@ def by_kind(surfaces, e, t, x, z):
 
 @inner(error_model="numpy")
 @no_type_check
-def _height(surfaces, e, t, s):
+def _height(surfaces, t, s):
     """Rise of a height field at a place s, its slope, and how that changes."""
-    cells = surfaces.rise.shape[2] - 1
-    u = s / surfaces.pitch - surfaces.first
+    cells, pitch, rise, slope = surfaces.cells[t], surfaces.pitch[t], surfaces.rise, surfaces.slope
+    u = s / pitch - surfaces.first[t]
     if not 0.0 <= u < cells:
-        end = 0 if not u >= 0.0 else cells
-        return surfaces.rise[e, t, end], 0.0, 0.0
+        return rise[t, 0 if not u >= 0.0 else cells], 0.0, 0.0
     g = int(u)
     u -= g
-    a, b = surfaces.rise[e, t, g], surfaces.rise[e, t, g + 1]
-    c, d = surfaces.slope[e, t, g] * surfaces.pitch, surfaces.slope[e, t, g + 1] * surfaces.pitch
+    a, b, c, d = rise[t, g], rise[t, g + 1], slope[t, g] * pitch, slope[t, g + 1] * pitch
     square, cube = 3.0 * (b - a) - 2.0 * c - d, 2.0 * (a - b) + c + d
-    rise = a + u * (c + u * (square + u * cube))
-    slope = (c + u * (2.0 * square + 3.0 * u * cube)) / surfaces.pitch
-    bend = (2.0 * square + 6.0 * u * cube) / (surfaces.pitch * surfaces.pitch)
-    return rise, slope, bend
+    return (
+        a + u * (c + u * (square + u * cube)),
+        (c + u * (2.0 * square + 3.0 * u * cube)) / pitch,
+        (2.0 * square + 6.0 * u * cube) / (pitch * pitch),
+    )

@@ -26,10 +26,10 @@ class SurfaceTable(NamedTuple):
     """Surfaces of mixed kinds, of s environments with t of them each.
 
     `kind` (t). All have a plane, `normal` (s, t, 2) and `offset` (s, t) [m], over which a height
-    field rises by `rise` [m] with the `slope` (s, t, g) at places (`first` + k) `pitch` [m] along
-    its tangent (n_z, -n_x), between which cubic Hermite splines are taken (de Boor, "A practical
-    guide to splines", 1978, chapter IV); beyond them it goes on level. `spread` (s, t) is how much
-    the rise differs at most [m].
+    field rises by `rise` (t, g) [m] with the `slope` (t, g) at `cells` (t) + 1 places (`first` + k)
+    `pitch` [m] along its tangent (n_z, -n_x), between which cubic Hermite splines are taken (de
+    Boor, "A practical guide to splines", 1978, chapter IV); beyond them it goes on level. `spread`
+    (t) is how much the rise differs at most [m].
     """
 
     kind: np.ndarray
@@ -37,6 +37,7 @@ class SurfaceTable(NamedTuple):
     offset: np.ndarray
     rise: np.ndarray
     slope: np.ndarray
+    cells: np.ndarray
+    first: np.ndarray
+    pitch: np.ndarray
     spread: np.ndarray
-    first: int
-    pitch: float

@@ -1,4 +1,4 @@
-"""The quasi-static step for half-plane terrains, one transition after the other.
+"""The quasi-static step, one transition after the other.
 
 `geometry` finds lowest points and first touches, `rest` the rest pose, `response` and `tangents`
 the derivatives, and `element` strings the parts of a transition together.

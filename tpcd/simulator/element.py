@@ -13,6 +13,7 @@ from typing import no_type_check
 import numpy as np
 
 from tpcd.geometry.candidates import first_touch, touching
+from tpcd.geometry.query import bent
 from tpcd.loops import inner
 from tpcd.simulator.events import NOTHING, next_event, respond_until
 from tpcd.simulator.path import (
@@ -104,7 +105,7 @@ def step_element(
     rested, parts, straight = request.rested, 1, CONVERGED
     modes, status, residual, relaxed = 0, CONVERGED, 0.0, False
     stage, done, length, spent = (STRAIGHT if rested else RESTING), 0.0, 1.0, 0
-    kind, seeks, moving, ahead, inside = TRY, False, False, np.inf, False
+    kind, seeks, moving, ahead, inside, bends = TRY, False, False, np.inf, False, False
     if rested:
         space.load[:] = 0.0
         inside = depth_inside(world, o, chains, pose, space.load) > START_DEPTH
@@ -221,7 +222,11 @@ def step_element(
             modes, status, residual, stage = now, CONVERGED, 0.0, STRAIGHT
             _keep(slopes, pose, kept_pose, height)
         elif stage == STRAIGHT:
-            parts = parts_of_path(request, command[2] - before[2], modes, now, terrains, slid)
+            way = math.hypot(command[0] - before[0], command[1] - before[1])
+            bends = bent(world.surfaces) and (fraction < 1.0 or modes != 0)
+            parts = parts_of_path(
+                request, way, command[2] - before[2], modes, now, terrains, slid, bends
+            )
             if parts == 1:
                 break
             stage, straight, length = WALKING, status, 1.0 / parts
@@ -235,7 +240,7 @@ def step_element(
                 ahead = 0.0
             longest = part_end(done, 1.0 / parts, parts) - done
             kind, length = next_part(event[0] >= 0, seeks, ahead, longest)
-        elif stage == WALKING and status > straight:
+        elif stage == WALKING and status > straight and not bends:
             stage, status, residual = STRAIGHT_AFTER_ALL, CONVERGED, 0.0
             _restore(slopes, pose, kept_pose, height)
         else:

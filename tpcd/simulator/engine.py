@@ -11,9 +11,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tpcd.simulator.record import DEGREES, StepSettings
+from tpcd.terrain import Relief
 from tpcd.threads import in_parts
 
 if TYPE_CHECKING:
+    from tpcd.geometry.surfaces import HalfPlanes, SurfaceTable
     from tpcd.simulator.workspace import Law, Tape
 
 
@@ -29,6 +31,8 @@ class Asked(NamedTuple):
     previous: Float[Tensor, "b 3"] | None
     command: Float[Tensor, "b 3"]
     stiffness: Float[Tensor, "#b 3"]
+    reliefs: tuple[Relief | None, ...]
+    """Of each terrain."""
     outline: Int[Tensor, " b"]
     """Whose points each transition has."""
     scene: Int[Tensor, " b"]
@@ -62,7 +66,6 @@ def step(
     before (3) and command (3), and by the outline points. A backend other than `native` works on
     the `device` (None: the CPU)."""
     from tpcd.geometry.candidates import World
-    from tpcd.geometry.surfaces import HalfPlanes
     from tpcd.simulator.backends import solved_by
     from tpcd.simulator.batch import step_range
     from tpcd.simulator.request import Answer, Request
@@ -83,7 +86,7 @@ def step(
     )
     world = World(
         asked.points.detach().mT.contiguous().numpy(),
-        HalfPlanes(_array(asked.normals), _array(asked.offsets)),
+        _table(asked),
         np.zeros(1, np.int64),
         np.zeros((1, terrains)),
         _array(asked.friction),
@@ -113,6 +116,34 @@ def step(
     wanted = np.ones(count, np.bool_)
     solved_by(settings.solver, run, wanted, len(law.room), terrains, device or torch.device("cpu"))
     return answered
+
+
+def _table(asked: Asked) -> HalfPlanes | SurfaceTable:
+    """The surfaces as the compiled loops read them: half-planes alone are the fast case."""
+    from tpcd.geometry.surfaces import HEIGHT_FIELD, PLANE, HalfPlanes, SurfaceTable
+
+    normal, offset = _array(asked.normals), _array(asked.offsets)
+    reliefs = asked.reliefs
+    if not any(reliefs):
+        return HalfPlanes(normal, offset)
+    flat = Relief(torch.zeros(2).double(), torch.zeros(2).double(), 0, 1.0)
+    every = [relief or flat for relief in reliefs]
+    size = max(len(relief.rise) for relief in every)
+    heights = np.zeros((2, len(every), size))
+    for t, relief in enumerate(every):
+        heights[0, t, : len(relief.rise)] = relief.rise.numpy()
+        heights[1, t, : len(relief.rise)] = relief.slope.numpy()
+    return SurfaceTable(
+        np.array([HEIGHT_FIELD if relief else PLANE for relief in reliefs]),
+        normal,
+        offset,
+        heights[0].copy(),
+        heights[1].copy(),
+        np.array([len(relief.rise) - 1 for relief in every]),
+        np.array([relief.first for relief in every]),
+        np.array([relief.pitch for relief in every]),
+        np.array([float(relief.rise.max() - relief.rise.min()) for relief in every]),
+    )
 
 
 def law_of(settings: StepSettings, yielding: int = 0) -> Law:

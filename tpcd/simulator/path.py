@@ -34,6 +34,9 @@ PASSED = 0.02
 derivatives, whose error this keeps small."""
 ALMOST = 1e-9
 """Share of a part that is no part of its own."""
+LONGEST_WAY = 2e-3
+"""Most that the command goes in one part where what is touched is curved [m]: an object does not
+pass over what would hold it back."""
 MOST_SOUGHT = 16
 """Parts of a path that aim at a change of contact or are shortened; where it chatters, the rest is
 taken as it is."""
@@ -64,13 +67,16 @@ def ends_alike(before, now, terrains, slid):
 
 @njit(_nrt=False)
 @no_type_check
-def parts_of_path(request, turn, before, now, terrains, slid):
-    """Into how many parts the path is cut, after it was gone at once."""
+def parts_of_path(request, way, turn, before, now, terrains, slid, bends):
+    """Into how many parts the path is cut, after it was gone at once; `bends` says that what was
+    touched on the way is curved."""
     if request.substeps == 1:
         return 1
     parts = 1
     if request.follow_path or not ends_alike(before, now, terrains, slid):
         parts = request.substeps
+    if bends:
+        parts = max(parts, math.ceil(way / LONGEST_WAY - ALMOST))
     if now != 0 or before != 0:
         parts = max(parts, math.ceil(abs(turn) / request.largest_turn - ALMOST))
     return parts

@@ -70,6 +70,8 @@ def simulate_step(
     shapes = {name: one.shape[:-1] for name, one in zip(names, given, strict=False)}
     batch = one_batch({"scene": scene.batch_shape, **shapes})
     asked = _flat(scene, batch, pose, previous, command, stiffness)
+    if any(asked.reliefs) and settings.friction == "anitescu":
+        raise ValueError("convex friction knows planes only; take friction 'coulomb' on a relief")
     yields = scene.yields.reshape(-1)[asked.scene.to(device)].cpu()
     groups = [torch.nonzero(group).flatten() for group in (~yields, yields) if bool(group.any())]
     if len(groups) < 2:
@@ -165,6 +167,7 @@ def _flat(
         previous=None if previous is None else each(previous),
         command=each(command),
         stiffness=each(stiffness) if stiffness.ndim > 1 else ready(stiffness, 3),
+        reliefs=tuple(body.relief for body in scene.terrains),
         outline=outline.reshape(-1)[owner],
         scene=owner,
     )
@@ -184,8 +187,9 @@ def _part(asked: Asked, index: Tensor) -> Asked:
 
 
 def _settle(asked: Asked, settings: StepSettings, device: torch.device) -> Answered:
-    floating = [value for value in asked[:-2] if value is not None]
-    if needs_gradient(*floating):
+    if needs_gradient(asked.normals) and any(asked.reliefs):
+        raise ValueError("a relief has no derivative by its direction; detach it")
+    if needs_gradient(*(value for value in asked if isinstance(value, Tensor))):
         return Answered(*_Settle.apply(settings, device, *asked))
     return step(asked, settings, device=device)
 
@@ -246,6 +250,7 @@ class _Settle(torch.autograd.Function):
             previous if given[6] else None,
             command,
             stiffness.sum(0, keepdim=True) if shared == 1 else stiffness,
+            None,
             None,
             None,
         )

@@ -284,6 +284,7 @@ def append_further(
                     space.right[j] = -space.load[t]
             direct = _direct(world, o, event, 0.0, pose, space, slopes.rate)
             _string_row(slopes, further, terrains + t, direct, 0.0, 0, 0.0, 0)
+            # Of what is curved this is not asked.
             _clear(space)
             _by_normal(world, o, law, t, turn, pose, space)
             later = _turned_gap(world, o, t, passed, turn, pose) if t == coming else 0.0

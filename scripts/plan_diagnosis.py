@@ -67,6 +67,7 @@ class Planning:
 
     def _check_plan(self) -> None:
         from tpcd.contract import LARGEST_ANGLE, LARGEST_LENGTH
+        from tpcd.truth.motions import LARGEST_TILT
 
         if len(self.start) != 3:
             raise ValueError(f"start has {len(self.start)} numbers, expected x z phi [m, m, rad]")
@@ -79,6 +80,12 @@ class Planning:
         if abs(self.start[2]) > LARGEST_ANGLE:
             told = f"start phi is {self.start[2]:g}, expected rad; it looks like degrees"
             raise ValueError(told)
+        if abs(self.start[2]) > LARGEST_TILT:
+            raise ValueError(
+                f"start phi is {self.start[2]:g}, expected at most {LARGEST_TILT:g} either way:"
+                " plans hold the object about phi = 0; turn the hand first, or count phi from"
+                " where it is"
+            )
 
 
 def plan_diagnosis(config: Planning) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from eval.calibration import Calibration, calibrate, coverage_by_misfit, coverag
 from eval.conditional import conditional_places
 from eval.drawn import draw_episode
 from eval.lines import append_lines, read_lines, write_line
+from eval.opened import opened_run
 from tpcd.belief.belief import misfit_field
 from tpcd.belief.history import history_of
 from tpcd.belief.likelihood import history_likelihood
@@ -23,6 +25,7 @@ from tpcd.belief.settings import EstimatorSettings
 from tpcd.errors import RunError
 from tpcd.parameters import Parameters
 from tpcd.shape.builtin import builtin_outlines
+from tpcd.shape.checkpoint import find_prior
 from tpcd.shape.polygon import PolygonShape
 
 
@@ -152,3 +155,21 @@ def test_the_belief_between_moves_is_another_than_the_last_one(tmp_path: Path) -
         places.append(read_lines(out / "runs.jsonl")[0]["place"])
     assert places[0] != places[1]
     assert np.abs(np.subtract(*places)).max() < 0.5
+
+
+def test_a_run_does_not_go_on_with_a_prior_that_was_trained_again(tmp_path: Path) -> None:
+    """Under the same name: its figures would be of both."""
+    prior, out = tmp_path / "prior", tmp_path / "run"
+    shutil.copytree(find_prior("ycb21-z2"), prior)
+    config = Calibration(out=out, runs=1, steps=3, quick=True, prior=str(prior))
+    with opened_run(config, "calibrate", ("out", "runs"), resume=False):
+        pass
+    with opened_run(config, "calibrate", ("out", "runs"), resume=True):
+        pass
+    shutil.rmtree(prior)
+    shutil.copytree(find_prior("ycb-rich"), prior)
+    with (
+        pytest.raises(RunError, match="goes on with another prior .*name a new folder"),
+        opened_run(config, "calibrate", ("out", "runs"), resume=True),
+    ):
+        pass

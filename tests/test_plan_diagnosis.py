@@ -201,7 +201,6 @@ def test_the_command_says_what_an_episode_lacks(
             return [need for need in needs if need == "pause"]
 
     fake = ModuleType("tpcd.discrepancy.coverage")
-    fake.MOTIONS = {"pause": "stand still", "floor load": "press"}  # type: ignore[attr-defined]
     fake.coverage_of = lambda episodes: Coverage()  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "tpcd.discrepancy.coverage", fake)
     words = ("--object", "mug", "--steps", "2", "--truth", "quasistatic")
@@ -209,7 +208,7 @@ def test_the_command_says_what_an_episode_lacks(
     capsys.readouterr()
     assert call("plan_diagnosis", "--after", str(tmp_path / "a.csv")) == 0
     printed = capsys.readouterr().out
-    assert "stand still" in printed and "command_lag" in printed
+    assert MOTIONS["pause"] in printed and "command_lag" in printed
     assert "1 of 23 effects are hardly excited: command_lag" in printed
     assert "hides" not in printed and "could not" not in printed
     assert len(read_episode(tmp_path / "a.csv")) == 3
@@ -228,6 +227,10 @@ BAD = {
     "degrees": (
         ("--start", "0", "0.1", "30", "--floor-height", "0", "--wall-position", "1", "--out", "a"),
         "start phi is 30, expected rad; it looks like degrees",
+    ),
+    "turned": (
+        ("--start", "0", "0.1", "0.5", "--floor-height", "0", "--wall-position", "1", "--out", "a"),
+        "start phi is 0.5, expected at most 0.15",
     ),
     "no episode": (("--after", "nowhere.csv"), "nowhere.csv: no such file"),
 }

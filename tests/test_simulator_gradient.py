@@ -287,3 +287,40 @@ def test_gradients_that_are_not_asked_for_cost_nothing_and_are_none():
         assert not simulate_step(
             scene, start, command.requires_grad_(), STIFFNESS
         ).pose.requires_grad
+
+
+@pytest.mark.parametrize("law", ["coulomb", "anitescu"])
+def test_derivatives_along_paths_in_parts_are_differences_too(law):
+    """By the command, of boxes that are pressed and pushed about a corner, where both one-sided
+    differences of two sizes agree."""
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    count, settings = 400, StepSettings(friction=law)
+    scene = make_scene(BOX.expand(count, *BOX.shape), uniform(0.2, 0.9, count), position=0.10)
+    start = torch.stack(
+        (uniform(0, 0.05, count), uniform(0.07, 0.08, count), 0.0 * uniform(0, 1, count)), -1
+    )
+    before = start + vector(-0.03, -0.06, -0.1) + vector(0.09, 0.04, 0.2) * uniform(0, 1, count, 3)
+    command = (
+        before + vector(-0.06, -0.04, -0.1) + vector(0.12, 0.07, 0.2) * uniform(0, 1, count, 3)
+    )
+    rest = simulate_step(scene, start, before, STIFFNESS, settings).pose
+    way = vector(0.01, 0.01, 0.1) * uniform(-1, 1, count, 3)
+
+    def height(command):
+        return simulate_step(scene, rest, command, STIFFNESS, settings, previous=before)
+
+    asked = command.clone().requires_grad_()
+    found = height(asked)
+    slope = (torch.autograd.grad(found.pose.sum(), asked)[0] * way).sum(-1)
+    ends = []
+    for size in (1e-4, -1e-4, 1e-5, -1e-5):
+        ends.append((height(command + size * way).pose - found.pose.detach()).sum(-1) / size)
+    ends = torch.stack(ends)
+    smooth = (ends.amax(0) - ends.amin(0)) < 0.01 * ends[2:].mean(0).abs() + 1e-5
+    smooth &= found.status == StepStatus.CONVERGED
+    off = (slope - ends[2:].mean(0)).abs() > 0.05 * ends[2:].mean(0).abs() + 1e-5
+    assert int(smooth.sum()) > 380 and float(off[smooth].double().mean()) < 0.01

@@ -16,7 +16,7 @@ import torch
 import yaml
 
 from tpcd.data import check_episode, read_episode
-from tpcd.errors import EpisodeError
+from tpcd.errors import EpisodeError, RobotError
 from tpcd.parameters import DEFAULT_BOUNDS, SCENE_NAMES
 from tpcd.shape.builtin import builtin_outlines
 from tpcd.truth.make import make_truth
@@ -187,6 +187,19 @@ def test_a_test_trajectory_has_as_many_commands_as_asked():
     history = History(plan.commands, plan.commands, plan.commands, scene.stiffness)
     with pytest.raises(ValueError, match="the plan has 101 rows"):
         plan.next_command(history)
+
+
+def test_a_plan_is_not_followed_from_where_it_does_not_begin():
+    plan = PlannedMotion(torch.tensor([[0.0, 0.1, 0.0], [0.01, 0.1, 0.0]], dtype=torch.float64))
+
+    def first(*start):
+        rows = torch.tensor([start], dtype=torch.float64)
+        return plan.next_command(History(rows, rows, rows, torch.ones(3).double()))
+
+    assert first(0.004, 0.096, 0.04).tolist() == [0.01, 0.1, 0.0]
+    for start in ((0.006, 0.1, 0.0), (0.0, 0.094, 0.0), (0.0, 0.1, -0.06)):
+        with pytest.raises(RobotError, match="but the plan begins at .*put the hand there"):
+            first(*start)
 
 
 def test_the_noise_of_an_episode_is_what_its_yaml_says():

@@ -105,6 +105,8 @@ def step_element(
     rested, parts, straight = request.rested, 1, CONVERGED
     modes, status, residual, relaxed = 0, CONVERGED, 0.0, False
     stage, done, length, spent = (STRAIGHT if rested else RESTING), 0.0, 1.0, 0
+    # Convex friction pushes on what it does not touch: no gap or load foretells its changes.
+    locates = request.finest < 1.0 and law.coulomb
     kind, seeks, moving, ahead, inside, bends = TRY, False, False, np.inf, False, False
     if rested:
         space.load[:] = 0.0
@@ -155,7 +157,7 @@ def step_element(
             jammed = relaxed and ended == RELAXED
             now = contact_modes(space, terrains)
         gone = share - done
-        idle = stage != WALKING or request.finest == 1.0 or spent == MOST_SOUGHT
+        idle = stage != WALKING or not locates or spent == MOST_SOUGHT
         fits = idle or gone <= least_part(kind, request.finest) * (1.0 + ALMOST)
         fits = fits or ends_alike(modes, now, terrains, slid)
         if not idle and (kind == AIM or not fits):
@@ -230,7 +232,7 @@ def step_element(
             if parts == 1:
                 break
             stage, straight, length = WALKING, status, 1.0 / parts
-            if request.finest < 1.0 and not ends_alike(modes, now, terrains, slid):
+            if locates and not ends_alike(modes, now, terrains, slid):
                 seeks, kind, length = True, LOOK, GLANCE
             _restore(slopes, pose, kept_pose, height)
             status, residual = CONVERGED, 0.0

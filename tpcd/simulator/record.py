@@ -85,7 +85,8 @@ class StepSettings:
     the whole step (see `StepStatus`), the whole one is the answer."""
     finest: float = 1 / 32
     """Changes of contact are located where a load or a gap is expected to come to zero; where none
-    is, parts are halved down to this share of the path (see `walk`). With 1, none is located."""
+    is, parts are halved down to this share of the path (see `path`). With 1, and under convex
+    friction, none is located."""
     largest_turn: float = 0.05
     """Most that the command turns in one part where anything is touched [rad]: what rolls or
     slips while it turns depends on the path too."""

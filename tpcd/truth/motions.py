@@ -17,6 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tpcd.errors import RobotError
+
 FORCE_LIMIT = 8.0
 """Largest force on an axis if the arm were blocked where it stands [N]."""
 TOUCH_FORCE = 1.2
@@ -30,6 +32,9 @@ SEARCH_STEP_RIGHT = 0.035
 """Steps of the search for floor and wall [m]."""
 LARGEST_TILT = 0.15
 """Largest commanded angle [rad]."""
+
+START_OFF, START_TURNED = 5e-3, 0.05
+"""An arm further than this from where a plan begins [m, rad] does not stand there."""
 
 Script = Generator[tuple[float, float, float], "History", None]
 
@@ -60,8 +65,20 @@ class PlannedMotion:
         self.commands = commands
 
     def next_command(self, history: History) -> Float[Tensor, " 3"]:
-        """Row k of the plan after k measured rows; row 0 is the start pose."""
+        """Row k of the plan after k measured rows; row 0 is the start pose. `RobotError` where the
+        arm does not stand there: the plan's ways and forces would be others."""
         step = history.commands.shape[0]
+        away = (history.poses[0] - self.commands[0]).abs() if step == 1 else torch.zeros(3)
+        if bool((away[:2] > START_OFF).any()) or float(away[2]) > START_TURNED:
+            stands, asked = (
+                ", ".join(f"{value:.3f}" for value in pose.tolist())
+                for pose in (history.poses[0], self.commands[0])
+            )
+            raise RobotError(
+                f"the arm stands at ({stands}), but the plan begins at ({asked}) [m, m, rad]: put"
+                " the hand there, check the origin, or plan from where it stands",
+                resumable=False,
+            )
         if step >= len(self.commands):
             raise ValueError(f"the plan has {len(self.commands)} rows, asked for row {step}")
         return self.commands[step]

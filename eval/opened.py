@@ -11,7 +11,6 @@ from typing import Any
 from tpcd.errors import RunError
 from tpcd.files import read_json, write_json
 from tpcd.results import CONFIG_FILE, resumed_run, run_folder
-from tpcd.shape.checkpoint import prior_hash
 
 PRIORS_FILE = "priors.json"
 """Name of each prior and the SHA-256 of its weights."""
@@ -35,6 +34,8 @@ def opened_run(
 
 def _check_priors(config: Any, folder: Path) -> None:
     """Keep which weights the priors of the configuration have; refuse others in the same run."""
+    from tpcd.shape.checkpoint import prior_hash
+
     given = [getattr(config, name, None) for name in ("prior", "paper_prior")]
     names = [str(name) for name in (*given, *getattr(config, "priors", ())) if name]
     now = {name: prior_hash(name) for name in names}

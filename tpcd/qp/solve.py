@@ -1,4 +1,4 @@
-"""The public door of the contact problems: check once, choose an backend, fill the answer.
+"""The public door of the contact problems: check once, choose a backend, fill the answer.
 
 Backends find active sets; everything that all of them share is here: statuses, the elastic
 fallback, the residual, units, and the gradients of differentiate.py.

@@ -140,7 +140,10 @@ def test_an_object_larger_than_any_of_the_prior_is_no_effect(shape: PolygonShape
     for name, true in zip(("object_width", "object_height"), extents.tolist(), strict=True):
         size = next(e for e in found.theta_after if e.name == name)
         assert abs(size.value - true) < 2 * size.sd and size.sd < 0.004
-    assert found.unexplained_before > 0.2 > found.unexplained_after
+    # Which of two places the model without the scale ends in is a matter of seeds: 5 to 30 % are
+    # unexplained there. Its evidence is the same.
+    assert found.log_evidence > found.log_evidence_base + 50
+    assert found.unexplained_before > 0.03 > found.unexplained_after
 
 
 def test_a_simulator_that_lifts_what_slides_is_called_numerics(shape: PolygonShape) -> None:

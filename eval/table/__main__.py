@@ -21,7 +21,7 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from eval.lines import append_lines, read_lines, write_line
 from eval.opened import shared_run
@@ -98,10 +98,11 @@ class Table:
         for truth in self.truths:
             if truth not in TRUTHS:
                 raise ValueError(f"truth is {truth!r}, expected one of {', '.join(TRUTHS)}")
+        from tpcd.policies.named import PolicyName
+
         for row in self.rows:
             estimator, _, policy = row.partition("/")
-            policies = ("random", "grid", "expert", "active", "lookahead", "rich")
-            if estimator not in ("paper", "default") or policy not in policies:
+            if estimator not in ("paper", "default") or policy not in get_args(PolicyName):
                 raise ValueError(f"row is {row!r}, expected for example 'default/active'")
 
 

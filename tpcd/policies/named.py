@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from tpcd.policies.active import ActivePolicy, ActiveSettings, Task
 from tpcd.policies.basic import GridPolicy, MotionPolicy
@@ -21,7 +21,7 @@ def make_policy(
 ) -> Policy:
     """The policy of a name; only the expert looks at the scene, and there only at the wall.
 
-    Raises ValueError for an expert without a scene.
+    Raises ValueError for an expert without a scene, and for another name.
     """
     if name == "active":
         return ActivePolicy(limits, task=task)
@@ -35,4 +35,6 @@ def make_policy(
         if scene is None:
             raise ValueError("the expert needs to see the wall, and there is no scene")
         return MotionPolicy(lambda: expert_motion(scene.wall_position), limits)
-    return MotionPolicy(lambda: rich_exploration(stream(seed, _MOTION_STREAM)), limits)
+    if name == "rich":
+        return MotionPolicy(lambda: rich_exploration(stream(seed, _MOTION_STREAM)), limits)
+    raise ValueError(f"policy is {name!r}, expected one of {', '.join(get_args(PolicyName))}")

@@ -1,7 +1,7 @@
 """The public door of the contact problems: check once, choose a backend, fill the answer.
 
 Backends find active sets; everything that all of them share is here: statuses, the elastic
-fallback, the residual, units, and the gradients of differentiate.py.
+fallback, the residual, units, and the gradients of derivative.py.
 """
 
 from __future__ import annotations
@@ -66,9 +66,11 @@ def _solve_flat(problem: ContactQP, backend: str, iteration_limit: int | None) -
         from tpcd.qp.batch import solve_native
 
         return solve_native(problem, iteration_limit)
-    from tpcd.qp.qpth_backend import solve_qpth
+    if backend == "qpth":
+        from tpcd.qp.qpth_backend import solve_qpth
 
-    return solve_qpth(problem)
+        return solve_qpth(problem)
+    raise AssertionError(f"{backend} is in BACKENDS, and nothing solves it")
 
 
 def _answer_infeasible(

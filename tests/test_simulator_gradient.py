@@ -324,3 +324,22 @@ def test_derivatives_along_paths_in_parts_are_differences_too(law):
     smooth &= found.status == StepStatus.CONVERGED
     off = (slope - ends[2:].mean(0)).abs() > 0.05 * ends[2:].mean(0).abs() + 1e-5
     assert int(smooth.sum()) > 380 and float(off[smooth].double().mean()) < 0.01
+
+
+@SOFT
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.4, 0.8])
+def test_a_face_that_is_pressed_straight_down_turns_as_differences_say(compliance, friction):
+    """Two rows bear all load there; what those forbid that bear none is in the derivative too."""
+    box = vector([-0.04, -0.06], [0.04, -0.06], [0.04, 0.06], [-0.04, 0.06])
+    start, given = vector(0.0, 0.08, 0.0), vector(0.0, 0.04, 0.0)
+    soft = compliance * vector(1.0, 0.5)
+    scene = make_scene(box, friction, position=0.2, compliance=soft)
+    command = given.clone().requires_grad_()
+    turned = simulate_step(scene, start, command, STIFFNESS).pose[2]
+    slope = torch.autograd.grad(turned, command)[0]
+    steps = 1e-5 * torch.eye(3, dtype=torch.float64)
+    ahead, behind = (
+        simulate_step(scene, start.expand(3, 3), given + sign * steps, STIFFNESS).pose[:, 2]
+        for sign in (1, -1)
+    )
+    torch.testing.assert_close(slope, (ahead - behind) / 2e-5, rtol=1e-3, atol=1e-6)

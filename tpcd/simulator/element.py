@@ -44,6 +44,7 @@ from tpcd.simulator.rest import (
     RELAXED,
     START_INSIDE,
     WANTED,
+    hold_both_sides,
     settle,
 )
 from tpcd.simulator.tangents import (
@@ -185,6 +186,8 @@ def step_element(
             status, residual = max(status, ended), max(residual, left)
             landing_response(world, o, start, part, fraction, point, terrain, slopes)
             turn = (math.cos(pose[2]), math.sin(pose[2]))
+            if law.coulomb:
+                hold_both_sides(space)
             linear_system(world, o, law, part, pose, turn, space)
             if share == 1.0:
                 off = distance_from_rest(world, o, chains, law, extent, part, pose, turn, space)

@@ -362,3 +362,31 @@ def _choose(world, o, law, pose, turn, space):
         # A point that is held by both its sides has not slipped; where all of a terrain's load
         # is at one edge of the friction cone, slip begins, however little it still is.
         space.slipping[j] = not held and (one_sided or space.slipping[j])
+
+
+@inner
+@no_type_check
+def hold_both_sides(space):
+    """Hold a face that rests on one side of one point and the other side of another, as it does
+    where nothing pulls along it, by the first point's other side too: it bears nothing, but
+    without it the face could turn and slip together, which rows without load forbid. Of Coulomb
+    friction only: a convex row may be loaded by a point that does not touch."""
+    for j in range(len(space.room)):
+        for i in range(j):
+            if space.chosen[j, 0] < 0 or space.chosen[i, 0] < 0 or space.slipping[j]:
+                continue
+            apart = space.chosen[i, 0] != space.chosen[j, 0] and space.side[i] != space.side[j]
+            if not apart or space.chosen[i, 1] != space.chosen[j, 1] or space.slipping[i]:
+                continue
+            free, others = -1, 0
+            for f in range(len(space.room)):
+                if space.chosen[f, 0] < 0:
+                    free = f
+                elif space.chosen[f, 1] == space.chosen[j, 1]:
+                    others += 1
+            if free >= 0 and others == 2:
+                for a in range(3):
+                    space.chosen[free, a] = space.chosen[i, a]
+                space.multiplier[free], space.side[free] = 0.0, -space.side[i]
+                space.slipping[free] = False
+                return

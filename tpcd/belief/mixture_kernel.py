@@ -1,5 +1,4 @@
-"""Sums of Student densities in compiled loops; see `proposals` and `flat_mixture`. Imported only
-where numba is."""
+"""Sums of Student densities in compiled loops; see `proposals` and `flat_mixture`."""
 
 from __future__ import annotations
 

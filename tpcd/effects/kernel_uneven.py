@@ -1,5 +1,4 @@
-"""Outlines laid over an uneven floor in compiled loops; see `uneven`. Imported only where numba
-is."""
+"""Outlines laid over an uneven floor in compiled loops; see `uneven`."""
 
 from __future__ import annotations
 

@@ -8,6 +8,9 @@ n·p = d, with the place s = n_z x - n_x z along its tangent, is the zero of
 of which the gap is f / |grad f|, the distance to first order; it is exact on the surface, where all
 that bears load is. The curvature k = -h'' / |grad f|^3 is how fast the normal turns along the
 tangent, dn = k tangent ds: positive where the surface bulges out.
+
+The functions on top give names and types; which body runs is chosen by the class of the table when
+a loop is compiled (`overload`), and outside of compiled loops there is none.
 """
 
 from __future__ import annotations
